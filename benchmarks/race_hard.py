@@ -33,13 +33,22 @@ OURS: dict[str, dict[str, Any]] = {
 Draw = Callable[[np.random.Generator], dict[str, Any]]
 
 
-def draws(rollouts: int = 1024, simulated: tuple[int, ...] = ()) -> dict[str, tuple[str, Draw]]:
-    """List the rivals whose settings are tuned: module, and how random settings are drawn.
+def sampled(methods: tuple[str, ...], rollouts: int) -> Draw:
+    """Draw settings of one of these methods with so many rollouts."""
 
-    Args:
-        rollouts: of sampling on the LCS.
-        simulated: numbers of rollouts of sampling in MuJoCo.
-    """
+    def draw(random: np.random.Generator) -> dict[str, Any]:
+        iterations = int(random.choice([n for n in (1, 2, 4, 8, 16, 32) if rollouts // n >= 4]))
+        method = str(random.choice(methods))
+        keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
+        spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
+        how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
+        return {**how, "spread": spread, "hold": hold, "keep": keep}
+
+    return draw
+
+
+def draws() -> dict[str, tuple[str, Draw]]:
+    """List the rivals whose settings are tuned: module, and how random settings are drawn."""
 
     def consensus(iterations: int, **fixed: str) -> Draw:
         def draw(random: np.random.Generator) -> dict[str, Any]:
@@ -49,17 +58,6 @@ def draws(rollouts: int = 1024, simulated: tuple[int, ...] = ()) -> dict[str, tu
             )
             numbers = {"weight": weight, "growth": growth, "gap": gap, "action": action, "prefer": prefer}
             return {**fixed, "iterations": iterations, **numbers}
-
-        return draw
-
-    def sampled(methods: tuple[str, ...], rollouts: int) -> Draw:
-        def draw(random: np.random.Generator) -> dict[str, Any]:
-            iterations = int(random.choice([n for n in (1, 2, 4, 8, 16, 32) if rollouts // n >= 4]))
-            method = str(random.choice(methods))
-            keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
-            spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
-            how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
-            return {**how, "spread": spread, "hold": hold, "keep": keep}
 
         return draw
 
@@ -73,9 +71,7 @@ def draws(rollouts: int = 1024, simulated: tuple[int, ...] = ()) -> dict[str, tu
     rivals["C3, 10 iterations"] = ("admm", consensus(10, project="lcp"))
     rivals["C3, 10 iterations, exact"] = ("admm", consensus(10, project="exact"))
     rivals["IMPACT-like"] = ("impact", lagrangian)
-    rivals |= {f"{m.upper()}, {rollouts} rollouts": ("sampling", sampled((m,), rollouts)) for m in ("cem", "mppi")}
-    tries = {f"sampling in MuJoCo, {n} rollouts": ("simulated", sampled(("cem", "mppi"), n)) for n in simulated}
-    return rivals | tries
+    return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled((m,), 1024)) for m in ("cem", "mppi")}
 
 
 def objectives(problem: Problem, mpc: MPCProblem, u: np.ndarray) -> np.ndarray:

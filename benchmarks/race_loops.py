@@ -26,14 +26,15 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from race_hard import MODULES, draws
+from race_hard import MODULES, Draw, draws, sampled
+from race_hard import TUNED as RACE_TUNED
 from rivals import sampling
 from rivals.problem import Problem
 from rivals.run import cpu
 from torch import Tensor
 
 import difflcs_envs
-from difflcs import GoalCost, LCSMPCLayer, LCSModel
+from difflcs import GoalCost, LCSModel, LCSMPCLayer
 from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning
 from difflcs.mpc.backends import Backend, BatchedBackend
@@ -52,7 +53,8 @@ TUNED = Path(__file__).parent / "rivals" / "tuned_loops.json"
 OURS = {"difflcs": {}, 'difflcs `"fast"`': {"effort": "fast"}}
 SEED, TUNING_SEED = 5000, 3000
 COARSE = 0.005  # [s] steps of the second simulation of hand and box, in which rollouts are tried
-ROLLOUTS = {"cube": (256, (16, 160)), "box": (64, (4, 40, 400)), "hand": (256, (4, 40))}  # on the LCS, in MuJoCo
+ROLLOUTS = {"cube": (256, 4, 32), "box": (64, 4, 20), "hand": (64, 4, 20)}  # on the LCS, and twice in MuJoCo
+LEFT_OUT = {"hand": ("IMPACT-like", "C3, 10 iterations, exact")}  # 10 s a decision, and 3^56 supports
 
 
 @dataclass
@@ -62,7 +64,9 @@ class Options:
     tasks: tuple[str, ...] = ("cube", "box", "hand")
     """Tasks to play; the others stay as they are in the file."""
     episodes: int = 100
-    """Episodes of each planner."""
+    """Episodes of each planner, at most."""
+    seconds: float = 150.0
+    """CPU seconds of a planner on a task, after which no further episode begins."""
     only: tuple[str, ...] = ()
     """Labels of the planners that play; all if none is named."""
     tune: float = 0.0
@@ -160,9 +164,11 @@ class Loop(ABC):
     layer: LCSMPCLayer
     guess: Primal | None = None
     env: Any
+    planner: Planner
 
-    def __init__(self, planner: Planner):
-        self.planner = planner
+    def take(self, planner: Planner) -> None:
+        """Plan with this one from now on."""
+        self.planner = self.layer.backend = planner
         planner.imagine = self.imagine
 
     def begin(self, seed: int) -> None:
@@ -191,16 +197,16 @@ class Loop(ABC):
         self.guess = plan.shift() if bool(plan.converged) else None
         return plan.action.numpy()
 
-    def play(self, seed: int) -> tuple[bool, float, int, float]:
+    def play(self, seed: int, limit: int) -> tuple[bool, float, int, float]:
         """Play an episode: success, cost, decisions, and their CPU time [s].
 
-        The cost is the mean over all decisions of the limit of the distance to the goal, 0 after a success, in parts of
-        the first distance, at most 2 of them.
+        The cost is the mean distance to the goal over all decisions of the limit, 0 after a success, in parts of the
+        first distance, at most 2 of them.
         """
         self.guess, self.planner.last, errors, held, used = None, None, [], 0, 0.0
         self.begin(seed)
         first = max(self.error(), 1.0)
-        while len(errors) < self.limit and not (self.hold and held == self.hold):
+        while len(errors) < limit and not (self.hold and held == self.hold):
             seconds, u = cpu(self.plan)
             used += seconds
             self.move(u)
@@ -211,7 +217,7 @@ class Loop(ABC):
         success = held >= max(self.hold, 1)
         parts = np.minimum(np.array(errors) / first, 2.0)
         rest = 0.0 if success else parts[-1]
-        return success, float(parts.sum() + rest * (self.limit - len(parts))) / self.limit, len(parts), used
+        return success, float(parts.sum() + rest * (limit - len(parts))) / limit, len(parts), used
 
 
 class Cube(Loop):
@@ -219,11 +225,10 @@ class Cube(Loop):
 
     limit, hold = 20, 0
 
-    def __init__(self, planner: Planner):
-        super().__init__(planner)
+    def __init__(self) -> None:
         self.env: Any = gymnasium.make("difflcs/TriFingerMoveCube-v0").unwrapped
         self.twin, lcs = self.env.sibling().physics, LCSModel.from_pretrained("zoo:trifinger-cube")
-        self.layer = LCSMPCLayer(lcs, pushing_cost(), HORIZON, -ACTION_LIMIT, ACTION_LIMIT, planner, on_failure="mask")
+        self.layer = LCSMPCLayer(lcs, pushing_cost(), HORIZON, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
 
     def error(self) -> float:
         """See `Loop`."""
@@ -248,20 +253,22 @@ class Box(Loop):
 
     limit, hold, near = box_to_pose.STEPS, 1, 1.0
 
-    def __init__(self, planner: Planner):
-        super().__init__(planner)
+    def __init__(self) -> None:
         self.policy, self.module = box_to_pose.make_policy()
-        self.layer = self.policy.mpc
-        self.layer.backend = planner
-        self.direct = planner.module == "simulated"
-        if self.direct:
-            weights = {"goal_weight": box_to_pose.WEIGHT, "goal_weight_final": box_to_pose.FINAL}
-            weights |= {"input_weight": box_to_pose.EFFORT, "pair_weight": self.near, "pair_weight_final": self.near}
-            self.layer.cost = GoalCost.reach(5, 2, pairs=[(3, 0), (4, 1)], **weights)
+        self.layer, self.direct = self.policy.mpc, False
+        weights = {"goal_weight": box_to_pose.WEIGHT, "goal_weight_final": box_to_pose.FINAL}
+        weights |= {"input_weight": box_to_pose.EFFORT, "pair_weight": self.near, "pair_weight_final": self.near}
+        self.costs = self.layer.cost, GoalCost.reach(5, 2, pairs=[(3, 0), (4, 1)], **weights)
         self.model = mujoco.MjModel.from_xml_string(box_to_pose.WORLD.format(joints="<freejoint/>"))
         self.coarse = mujoco.MjModel.from_xml_string(box_to_pose.WORLD.format(joints="<freejoint/>"))
         self.coarse.opt.timestep = COARSE
         self.data, self.tried = mujoco.MjData(self.model), mujoco.MjData(self.coarse)
+
+    def take(self, planner: Planner) -> None:
+        """See `Loop`."""
+        super().take(planner)
+        self.direct = planner.module == "simulated"
+        self.layer.cost = self.costs[self.direct]
 
     def begin(self, seed: int) -> None:
         """See `Loop`."""
@@ -322,14 +329,13 @@ class Hand(Loop):
 
     limit, hold, pace = 100, 21, 0.5
 
-    def __init__(self, planner: Planner):
-        super().__init__(planner)
+    def __init__(self) -> None:
         self.env: Any = gymnasium.make("difflcs/HandTurnObject-v0", horizon=self.limit).unwrapped
         self.coarse, model = build_model("cube"), build_model("cube")
         self.coarse.opt.timestep, self.tried = COARSE, mujoco.MjData(self.coarse)
         self.module, high = hand_system(model), 0.1 * self.pace
         cost = hand_cost(self.module)
-        self.layer = LCSMPCLayer(self.module, cost, 4, -high, high, planner, 1e-3, "mask")
+        self.layer = LCSMPCLayer(self.module, cost, 4, -high, high, relaxation=1e-3, on_failure="mask")
 
     def look(self) -> tuple[Tensor, Tensor]:
         """See `Loop`; rotations count from here."""
@@ -353,38 +359,55 @@ class Hand(Loop):
 
 # --- the race ---------------------------------------------------------------------------------------------------------
 
-TASKS: dict[str, Callable[[Planner], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
+TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
+
+
+def rivals(task: str) -> dict[str, tuple[str, Draw]]:
+    """List the rivals of a task: module, and how random settings are drawn."""
+    lcs, *simulated = ROLLOUTS[task]
+    both = ("cem", "mppi")
+    found = {
+        k: v for k, v in draws().items() if v[0] != "sampling" and "100" not in k and k not in LEFT_OUT.get(task, ())
+    }
+    found |= {f"sampling on the LCS, {lcs} rollouts": ("sampling", sampled(both, lcs))}
+    return found | {f"sampling in MuJoCo, {n} rollouts": ("simulated", sampled(both, n)) for n in simulated}
 
 
 @torch.no_grad()
-def play(task: str, module: str, settings: dict[str, Any], seeds: range) -> dict[str, list[float]]:
-    """Play an episode for each seed: success, cost, decisions, and milliseconds of CPU of a decision by what takes it.
+def play(
+    loop: Loop, module: str, settings: dict[str, Any], seeds: range, seconds: float = math.inf, part: float = 1.0
+) -> dict[str, list[float]]:
+    """Play an episode, or a part of its decisions, for each seed, until the CPU time is used up.
 
-    That is: the whole decision, what a rival prepares for each new system, and the solver.
+    Returns:
+        Success, cost, decisions, and milliseconds of CPU of a decision: all, what a rival prepares for each new system,
+        and the solver.
     """
-    planner, rows = Planner(module, settings), []
-    loop = TASKS[task](planner)
+    planner, rows, until = Planner(module, settings), [], time.process_time() + seconds
+    loop.take(planner)
     for seed in seeds:
+        if time.process_time() > until and len(rows) > 1:
+            break
         planner.seconds[:] = 0
-        success, cost, decisions, used = loop.play(seed)
+        success, cost, decisions, used = loop.play(seed, round(part * loop.limit))
         rows.append([float(success), cost, decisions, *(1e3 * v / decisions for v in (used, *planner.seconds))])
     names = "success", "cost", "decisions", "all_ms", "prepare_ms", "solve_ms"
     return {name: [float(v) for v in column] for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def tune(task: str, label: str, module: str, draw: Any, seconds: float) -> dict[str, Any]:
-    """Draw settings for some CPU seconds, play two episodes with each; the best of the best four on eight others."""
+def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dict[str, Any]:
+    """Try the settings of single plans, then random ones: 20 decisions of three episodes; the best four play others."""
     random, until, tried = np.random.default_rng(0), time.process_time() + seconds, []
-    while time.process_time() < until or not tried:
-        settings = draw(random)
-        tried.append((np.mean(play(task, module, settings, range(TUNING_SEED, TUNING_SEED + 2))["cost"]), settings))
+    known = [family[label]["settings"] for family in json.loads(RACE_TUNED.read_text()).values() if label in family]
+    while time.process_time() < until or len(tried) < 3:
+        settings = known.pop() if known else draw(random)
+        first = play(loop, module, settings, range(TUNING_SEED, TUNING_SEED + 3), part=20 / loop.limit)
+        tried.append((np.mean(first["cost"]), settings))
     tried.sort(key=lambda pair: pair[0])
-    again = [
-        (np.mean(play(task, module, settings, range(TUNING_SEED + 2, TUNING_SEED + 10))["cost"]), settings)
-        for _, settings in tried[:4]
-    ]
+    others = range(TUNING_SEED + 3, TUNING_SEED + 15)
+    again = [(np.mean(play(loop, module, each, others, seconds / 4)["cost"]), each) for _, each in tried[:4]]
     cost, settings = min(again, key=lambda pair: pair[0])
-    print(f"{task:6s} {label:36s} {len(tried)} drawn, cost {cost:.3f}: {settings}", flush=True)
+    print(f"{label:36s} {len(tried)} drawn, cost {cost:.3f}: {settings}", flush=True)
     return {"module": module, "settings": settings}
 
 
@@ -396,20 +419,19 @@ def main(o: Options) -> None:
     tuned = json.loads(TUNED.read_text()) if TUNED.exists() else {}
     record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
     for task in o.tasks:
-        if o.tune:
-            for label, (module, draw) in draws(*ROLLOUTS[task]).items():
-                if not o.only or label in o.only:
-                    tuned.setdefault(task, {})[label] = tune(task, label, module, draw, o.tune)
-                    TUNED.write_text(json.dumps(tuned, indent=1) + "\n")
-            continue
-        planners = {label: ("ours", settings) for label, settings in OURS.items()}
-        planners |= {label: (row["module"], row["settings"]) for label, row in tuned.get(task, {}).items()}
+        loop = TASKS[task]()
+        planners: dict[str, Any] = {label: ("ours", settings) for label, settings in OURS.items()}
+        for label, (module, draw) in rivals(task).items():
+            if o.tune and (not o.only or label in o.only):
+                tuned.setdefault(task, {})[label] = tune(loop, label, module, draw, o.tune)
+                TUNED.write_text(json.dumps(tuned, indent=1) + "\n")
+            planners |= {label: (module, tuned[task][label]["settings"])} if not o.tune else {}
         for label, (module, settings) in planners.items():
-            if o.only and label not in o.only:
-                continue
-            found = play(task, module, settings, range(SEED, SEED + o.episodes))
-            record["results"].setdefault(task, {})[label] = figures(found)
-            save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, **record})
+            if not o.tune and (not o.only or label in o.only):
+                found = play(loop, module, settings, range(SEED, SEED + o.episodes), o.seconds)
+                record["results"].setdefault(task, {})[label] = figures(found)
+                print(f"{task:6s} {label:36s} {record['results'][task][label]}", flush=True)
+                save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, **record})
 
 
 def figures(found: dict[str, list[float]]) -> dict[str, Any]:
