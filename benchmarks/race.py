@@ -112,7 +112,7 @@ class Options:
     parts: tuple[str, ...] = ("contact", "linear", "global", "planners")
     """Parts to run; the others stay as they are in the file."""
     only: tuple[str, ...] = ()
-    """Labels of those who take part with contact and without; everybody if none is named."""
+    """Labels of those who take part, but for the global optima; everybody if none is named."""
     tune: float = 0.0
     """CPU seconds in which settings of each planner are drawn for each family, on other seeds; then it ends."""
     out: Path = Path("benchmarks/results/race.json")
@@ -457,7 +457,7 @@ def main(o: Options) -> None:
         install(o.venvs)
         return
     if o.tune:
-        tune(as_mpc, o.tune)
+        tune(as_mpc, o.tune, o.only)
         return
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
@@ -466,8 +466,12 @@ def main(o: Options) -> None:
     options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        alone = {"global": globally, "planners": lambda o: measure(as_mpc, o.problems, o.seeds, o.rounds)}
+        alone = {"global": globally, "planners": lambda o: measure(as_mpc, o.problems, o.seeds, o.rounds, o.only)}
+        old = results.get(name, {})
         results |= {name: alone[name](o)} if name in alone else dict(race(name, o))
+        if name == "planners" and o.only:  # the rows of the others stay
+            new = {family: {k: rows[k] for k in o.only if k in rows} for family, rows in results[name].items()}
+            results[name] = {family: {**old.get(family, {}), **rows} for family, rows in new.items()}
         save(o.out, {"machine": machine(), "options": options, "results": results})
 
 

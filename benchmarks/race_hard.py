@@ -22,6 +22,7 @@ ITERATIONS = (3, 10, 30, 100)  # of C3+
 LOOPS = ("pushing, n_lam 5", "pushing, n_lam 8", "cart-pole, H 10", "cart-pole, H 30", "chain of 4, H 10")
 STEPS = 25
 OTHER_SEEDS = 1000
+MOST_EXACT = 9  # n_lam for which all 3^n_lam supports can be tried
 MODULES: dict[str, Any] = {"layer": layer, "admm": admm, "impact": impact, "sampling": sampling}
 OURS: dict[str, dict[str, Any]] = {
     "difflcs": {},
@@ -85,12 +86,14 @@ def reference(problem: Problem, mpc: MPCProblem) -> np.ndarray:
     return np.minimum(*(objectives(problem, mpc, result.primal.u.numpy()) for result in plans))
 
 
-def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float) -> None:
-    """Draw settings of each rival for each family on other seeds, for some seconds; write the best."""
-    tuned: dict[str, dict[str, dict]] = {}
+def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float, only: tuple[str, ...] = ()) -> None:
+    """Draw settings of each rival, or `only` some, for each family on other seeds, for some seconds; write the best."""
+    tuned: dict[str, dict[str, dict]] = json.loads(TUNED.read_text()) if only else {}
     for family, problems in with_contact(3, 2, OTHER_SEEDS).items():
         known = [reference(p, as_mpc(p)) for p in problems]
         for label, (module, draw) in draws().items():
+            if (only and label not in only) or ("exact" in label and problems[0].n_lam > MOST_EXACT):
+                continue
             random, least, until = np.random.default_rng(0), np.inf, time.process_time() + seconds
             while time.process_time() < until:
                 settings, gaps = draw(random), []
@@ -106,15 +109,16 @@ def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float) -> None:
 
 
 def measure(
-    as_mpc: Callable[[Problem], MPCProblem], problems: int, seeds: int, rounds: int
+    as_mpc: Callable[[Problem], MPCProblem], problems: int, seeds: int, rounds: int, only: tuple[str, ...] = ()
 ) -> dict[str, dict[str, dict]]:
-    """Measure every planner on the families of the race.
+    """Measure every planner on the families of the race, or the first and `only` some.
 
     Args:
         as_mpc: function from a problem to an `MPCProblem`.
         problems: of each model.
         seeds: models of a family.
         rounds: how often everybody solves everything, taking turns; the shortest time of each problem counts.
+        only: labels; all if none is named.
 
     Returns:
         family → label → median seconds of a plan, mean and worst gap to the best plan of all under hard contact; and in
@@ -125,6 +129,7 @@ def measure(
         rivals = {label: (row["module"], row["settings"]) for label, row in tuned[family].items()}
         fresh = {"C3+, 10 iterations, new system": ("admm", {**rivals["C3+, 10 iterations"][1], "new": True})}
         planners = {label: ("layer", settings) for label, settings in OURS.items()} | rivals | fresh
+        planners = {k: v for k, v in planners.items() if not only or k == "difflcs" or k in only}
         table = {label: {"times": [], "gaps": [], "steps": [], "costs": []} for label in planners}
         for problem in members:
             mpc, found = as_mpc(problem), {}

@@ -47,7 +47,7 @@ from difflcs_envs.tasks import HORIZON, hand_cost, hand_system, pushing_cost
 from difflcs_envs.trifinger.task import ACTION_LIMIT
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))
-import box_to_pose
+import box_to_pose  # pyright: ignore[reportMissingImports]
 
 TUNED = Path(__file__).parent / "rivals" / "tuned_loops.json"
 OURS = {"difflcs": {}, 'difflcs `"fast"`': {"effort": "fast"}}

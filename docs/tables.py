@@ -142,10 +142,36 @@ def planners(record: dict) -> str:
     """Planners by families: time of a plan, and mean gap to the best plan of all under hard contact."""
     families = record["results"]["planners"]
     rows = [
-        [label, *(f"{duration(row[label]['seconds'])}, {percent(row[label]['gap'])}" for row in families.values())]
+        [
+            label,
+            *(
+                f"{duration(row[label]['seconds'])}, {percent(row[label]['gap'])}" if label in row else "—"
+                for row in families.values()
+            ),
+        ]
         for label in next(iter(families.values()))
     ]
     return table(["", *families], rows)
+
+
+def in_mujoco(record: dict) -> str:
+    """Planners by tasks in MuJoCo: success with its interval, cost, and CPU time of a decision in the solver."""
+    tasks, names = record["results"], {"cube": "cube", "box": "box to poses", "hand": "cube in the hand"}
+
+    def cell(row: dict | None) -> str:
+        if row is None:
+            return "—"
+        low, high = (f"{100 * v:.0f}" for v in row["interval"])
+        new = f"{number(row['prepare_ms'])} + " if row["prepare_ms"] > 0.05 else ""
+        return (
+            f"{100 * row['success']:.0f} % ({low}–{high}) of {row['episodes']}; {row['cost']:.2f} ± "
+            f"{row['cost_half']:.2f}; {new}{number(row['solve_ms'])} ms"
+        )
+
+    labels = dict.fromkeys(label for rows in tasks.values() for label in rows)
+    rows = [[label, *(cell(tasks[name].get(label)) for name in names)] for label in labels]
+    rest = [f"{number(tasks[name]['difflcs']['all_ms'] - tasks[name]['difflcs']['solve_ms'])} ms" for name in names]
+    return table(["", *names.values()], [*rows, ["*all else of a decision*", *rest]])
 
 
 def loops(record: dict) -> str:
@@ -476,6 +502,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
     "race_avx512": {"best": best("contact")},
     "race_planners": {"plans": planners, "loops": loops},
+    "race_loops": {"tasks": in_mujoco},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
