@@ -1,21 +1,18 @@
 """Closed loops in MuJoCo, ours beside planners made for contact: `python benchmarks/race_loops.py`. See docs/race.md.
 
-Every planner is a backend of the same layer: it gets the same system at each decision, the same cost, horizon and
-bounds. Some sample in MuJoCo itself, whose second copy they are given. `--tune 60` draws the rivals' settings on seeds
-below 4000; final figures are of seeds 5000 and up.
+Every planner is a backend of the same layer, so it gets the same system at each decision, the same cost, horizon and
+bounds. Sampling in MuJoCo itself has a second simulation. `--tune 12` draws settings on seeds from 3000; the figures
+are of seeds from 5000.
 """
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
-
-from __future__ import annotations
 
 import json
 import math
 import sys
 import time
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -27,10 +24,10 @@ import numpy as np
 import torch
 import tyro
 from race_hard import MODULES, Draw, draws, sampled
-from race_hard import TUNED as RACE_TUNED
-from rivals import sampling
+from race_hard import TUNED as TUNED_PLANS
 from rivals.problem import Problem
 from rivals.run import cpu
+from rivals.sampling import Solver as Sampling
 from torch import Tensor
 
 import difflcs_envs
@@ -52,7 +49,7 @@ import box_to_pose  # pyright: ignore[reportMissingImports]
 TUNED = Path(__file__).parent / "rivals" / "tuned_loops.json"
 OURS = {"difflcs": {}, 'difflcs `"fast"`': {"effort": "fast"}}
 SEED, TUNING_SEED = 5000, 3000
-COARSE = 0.005  # [s] steps of the second simulation of hand and box, in which rollouts are tried
+COARSE = 0.005  # [s] steps of the second simulation of box and hand
 ROLLOUTS = {"cube": (256, 4, 32), "box": (64, 4, 20), "hand": (64, 4, 20)}  # on the LCS, and twice in MuJoCo
 LEFT_OUT = {"hand": ("IMPACT-like", "C3, 10 iterations, exact")}  # 10 s a decision, and 3^56 supports
 
@@ -78,67 +75,60 @@ class Options:
 # --- planners ---------------------------------------------------------------------------------------------------------
 
 
-def as_rival(problem: MPCProblem) -> Problem:
-    """Convert a problem whose system and cost are the same at every stage."""
-    names = [f.name for f in fields(Problem) if f.name not in ("horizon", "relaxation", "constant", "weight")]
-    arrays = {name: getattr(problem, name).numpy().copy() for name in names}
-    none = {"constant": np.zeros(problem.batch), "weight": np.zeros(problem.n_u)}
-    return Problem(**arrays, horizon=problem.horizon, relaxation=problem.relaxation, **none)
-
-
 class Planner(Backend):
     """A planner as a backend, which counts its CPU time.
 
     Args:
         module: "ours", "simulated" (sampling in MuJoCo), or a file in `rivals/`.
         settings: of its `Solver`, or of `BatchedBackend`.
+        imagine: simulates actions (H, n_u) from where the robot is, returns the states (H+1, n_x).
 
     Attributes:
         seconds: CPU time [s] of what it prepares for each new system, and of planning.
-        imagine: simulates actions (H, n_u) from where the robot is, returns the states (H+1, n_x).
     """
 
     name = "race"
 
-    def __init__(self, module: str, settings: dict[str, Any]):
-        self.module, self.settings, self.seconds = module, settings, np.zeros(2)
+    def __init__(self, module: str, settings: dict[str, Any], imagine: Callable[[np.ndarray], np.ndarray]):
+        self.module, self.settings, self.imagine = module, settings, imagine
         self.ours = BatchedBackend(threads=1, **settings) if module == "ours" else None
-        self.random, self.imagine = np.random.default_rng(0), lambda u: u
-        self.last: Any = None
+        self.solver: Any = None
+        self.random, self.seconds = np.random.default_rng(0), np.zeros(2)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
-        """Plan for each problem; of a rival the states are those that its actions cause."""
+        """Plan for each problem; the states of a rival's plan are those that its actions cause."""
         if self.ours is not None:
-            seconds, result = cpu(lambda: self.ours.solve(problem, guess))  # pyright: ignore[reportOptionalMemberAccess]
+            solve = self.ours.solve
+            seconds, result = cpu(lambda: solve(problem, guess))
             self.seconds[1] += seconds
             return result
-        solver = self.prepared(as_rival(problem))
-        if isinstance(solver, sampling.Solver):
-            solver.random, solver.guess = self.random, None if guess is None else guess.u.numpy()
-        seconds, u = cpu(lambda: np.concatenate([solver.one(i).u for i in range(problem.batch)]))
+        self.prepare(problem)
+        if isinstance(self.solver, Sampling):
+            self.solver.random, self.solver.guess = self.random, None if guess is None else guess.u.numpy()
+        seconds, u = cpu(lambda: np.concatenate([self.solver.one(i).u for i in range(problem.batch)]))
         self.seconds[1] += seconds
         u = problem.clip(torch.from_numpy(np.nan_to_num(u)))
         x, lam = problem.rollout(u)
         zero = torch.zeros(problem.batch)
         return Result(Primal(x, u, lam, problem.no_multipliers()), zero.to(torch.int8), zero.int(), zero, zero)
 
-    def prepared(self, problem: Problem) -> Any:
-        """Make the solver, or take the last one where nothing but the state is new."""
-        if self.last is not None and all(
-            np.array_equal(getattr(problem, f.name), getattr(self.last.problem, f.name))
-            for f in fields(Problem)
-            if f.name != "x0"
-        ):
-            self.last.problem.x0[:] = problem.x0
-            return self.last
+    def prepare(self, problem: MPCProblem) -> None:
+        """Make the solver, or keep the last one if only the state is new."""
+        names = [f.name for f in fields(Problem) if f.name not in ("horizon", "relaxation", "constant", "weight")]
+        arrays = {name: getattr(problem, name).numpy().copy() for name in names}
+        x0, last = arrays.pop("x0"), None if self.solver is None else self.solver.problem
+        if last is not None and all(np.array_equal(value, getattr(last, name)) for name, value in arrays.items()):
+            last.x0 = x0
+            return
         kind: Any = Simulated if self.module == "simulated" else MODULES[self.module].Solver
-        seconds, self.last = cpu(lambda: kind(problem, **self.settings))
+        none = {"constant": np.zeros(problem.batch), "weight": np.zeros(problem.n_u)}
+        given = Problem(**arrays, **none, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
+        seconds, self.solver = cpu(lambda: kind(given, **self.settings))
         self.seconds[0] += seconds
-        self.last.imagine = self.imagine
-        return self.last
+        self.solver.imagine = self.imagine
 
 
-class Simulated(sampling.Solver):
+class Simulated(Sampling):
     """Sampling whose rollouts are those of MuJoCo."""
 
     imagine: Callable[[np.ndarray], np.ndarray]
@@ -151,45 +141,27 @@ class Simulated(sampling.Solver):
 # --- tasks ------------------------------------------------------------------------------------------------------------
 
 
-class Loop(ABC):
-    """A task, the layer that plans for it, and a second simulation for rollouts.
+class Loop:
+    """A task as a Gymnasium environment, the layer that plans for it, and a second simulation.
 
     Attributes:
         limit: decisions of an episode.
-        hold: decisions in a row at the goal after which it has succeeded; 0: whether it is there at the end counts.
+        hold: decisions in a row at the goal after which it has succeeded; 0: it must be there at the end.
     """
 
     limit: int
     hold: int
     layer: LCSMPCLayer
-    guess: Primal | None = None
     env: Any
-    planner: Planner
-
-    def take(self, planner: Planner) -> None:
-        """Plan with this one from now on."""
-        self.planner = self.layer.backend = planner
-        planner.imagine = self.imagine
 
     def begin(self, seed: int) -> None:
         """Begin an episode."""
+        self.guess: Primal | None = None
         self.seen, self.info = self.env.reset(seed=seed)
 
     def look(self) -> tuple[Tensor, Tensor]:
         """Return state and goal."""
         return torch.from_numpy(self.seen["state"]), torch.from_numpy(self.seen["goal"])
-
-    def move(self, u: np.ndarray) -> None:
-        """Execute an action."""
-        self.seen, _, _, _, self.info = self.env.step(u)
-
-    @abstractmethod
-    def error(self) -> float:
-        """Return the distance to the goal, 1 where it begins to count as reached; inf: the object is lost."""
-
-    @abstractmethod
-    def imagine(self, u: np.ndarray) -> np.ndarray:
-        """Simulate actions (H, n_u) from where the robot is: states (H+1, n_x)."""
 
     def plan(self) -> np.ndarray:
         """Return the next action, warm from the last plan."""
@@ -197,15 +169,34 @@ class Loop(ABC):
         self.guess = plan.shift() if bool(plan.converged) else None
         return plan.action.numpy()
 
+    def move(self, u: np.ndarray) -> None:
+        """Execute an action."""
+        self.seen, _, _, _, self.info = self.env.step(u)
+
+    def error(self) -> float:
+        """Return the distance to the goal, 1 where it begins to count as reached; inf: the object is lost."""
+        raise NotImplementedError
+
+    def copy(self) -> np.ndarray:
+        """Bring the second simulation to where the robot is; return its state."""
+        raise NotImplementedError
+
+    def attempt(self, u: np.ndarray) -> np.ndarray:
+        """Execute an action there; return the state after it."""
+        raise NotImplementedError
+
+    def imagine(self, u: np.ndarray) -> np.ndarray:
+        """Simulate actions (H, n_u) from where the robot is: states (H+1, n_x)."""
+        return np.array([self.copy(), *map(self.attempt, u)])
+
     def play(self, seed: int, limit: int) -> tuple[bool, float, int, float]:
         """Play an episode: success, cost, decisions, and their CPU time [s].
 
         The cost is the mean distance to the goal over all decisions of the limit, 0 after a success, in parts of the
         first distance, at most 2 of them.
         """
-        self.guess, self.planner.last, errors, held, used = None, None, [], 0, 0.0
         self.begin(seed)
-        first = max(self.error(), 1.0)
+        first, errors, held, used = max(self.error(), 1.0), [], 0, 0.0
         while len(errors) < limit and not (self.hold and held == self.hold):
             seconds, u = cpu(self.plan)
             used += seconds
@@ -214,10 +205,9 @@ class Loop(ABC):
             held = held + 1 if errors[-1] < 1 else 0
             if math.isinf(errors[-1]):
                 break
-        success = held >= max(self.hold, 1)
-        parts = np.minimum(np.array(errors) / first, 2.0)
-        rest = 0.0 if success else parts[-1]
-        return success, float(parts.sum() + rest * (limit - len(parts))) / limit, len(parts), used
+        success, parts = held >= max(self.hold, 1), np.minimum(np.array(errors) / first, 2.0)
+        rest = 0.0 if success else parts[-1] * (limit - len(parts))
+        return success, float(parts.sum() + rest) / limit, len(parts), used
 
 
 class Cube(Loop):
@@ -226,7 +216,7 @@ class Cube(Loop):
     limit, hold = 20, 0
 
     def __init__(self) -> None:
-        self.env: Any = gymnasium.make("difflcs/TriFingerMoveCube-v0").unwrapped
+        self.env = gymnasium.make("difflcs/TriFingerMoveCube-v0").unwrapped
         self.twin, lcs = self.env.sibling().physics, LCSModel.from_pretrained("zoo:trifinger-cube")
         self.layer = LCSMPCLayer(lcs, pushing_cost(), HORIZON, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
 
@@ -235,92 +225,71 @@ class Cube(Loop):
         task = self.env.task
         return max(self.info["position_error"] / task.position_tolerance, self.info["yaw_error"] / task.yaw_tolerance)
 
-    def imagine(self, u: np.ndarray) -> np.ndarray:
+    def copy(self) -> np.ndarray:
         """See `Loop`."""
         self.twin.set_full_state(self.env.physics.get_full_state())
-        x = [self.seen["state"]]
-        for action in u:
-            after = self.twin.step(action)
-            x.append(x[-1] if after is None else after)
-        return np.array(x)
+        self.state = self.seen["state"]
+        return self.state
+
+    def attempt(self, u: np.ndarray) -> np.ndarray:
+        """See `Loop`; where it becomes unstable it stays."""
+        after = self.twin.step(u)
+        self.state = self.state if after is None else after
+        return self.state
 
 
 class Box(Loop):
-    """A sphere pushes a box to poses, as in examples/box_to_pose.py, with the same places for every planner.
+    """A sphere pushes a box to poses, planned from the places of examples/box_to_pose.py.
 
-    Who samples in MuJoCo has no places: the sphere is drawn to the box by its cost.
+    Sampling in MuJoCo has no places: its cost draws the sphere to the box.
     """
 
     limit, hold, near = box_to_pose.STEPS, 1, 1.0
 
     def __init__(self) -> None:
-        self.policy, self.module = box_to_pose.make_policy()
-        self.layer, self.direct = self.policy.mpc, False
+        self.policy, module = box_to_pose.make_policy()
+        self.layer = self.policy.mpc
+        self.scene, self.twin = box_to_pose.Scene(module), box_to_pose.Scene(module, COARSE)
+        self.cost: Any = self.layer.cost
         weights = {"goal_weight": box_to_pose.WEIGHT, "goal_weight_final": box_to_pose.FINAL}
-        weights |= {"input_weight": box_to_pose.EFFORT, "pair_weight": self.near, "pair_weight_final": self.near}
-        self.costs = self.layer.cost, GoalCost.reach(5, 2, pairs=[(3, 0), (4, 1)], **weights)
-        self.model = mujoco.MjModel.from_xml_string(box_to_pose.WORLD.format(joints="<freejoint/>"))
-        self.coarse = mujoco.MjModel.from_xml_string(box_to_pose.WORLD.format(joints="<freejoint/>"))
-        self.coarse.opt.timestep = COARSE
-        self.data, self.tried = mujoco.MjData(self.model), mujoco.MjData(self.coarse)
-
-    def take(self, planner: Planner) -> None:
-        """See `Loop`."""
-        super().take(planner)
-        self.direct = planner.module == "simulated"
-        self.layer.cost = self.costs[self.direct]
+        weights |= {"input_weight": box_to_pose.EFFORT, "pair_weight": self.near}
+        self.drawn = GoalCost.reach(5, 2, pairs=[(3, 0), (4, 1)], **weights)
 
     def begin(self, seed: int) -> None:
         """See `Loop`."""
-        mujoco.mj_resetData(self.model, self.data)
-        random = np.random.default_rng(seed)
-        x, y, yaw = random.uniform(-1, 1, 3) * [0.1, 0.1, math.pi]
-        self.goal = random.uniform(-1, 1, 3) * [0.2, 0.2, math.pi]
-        towards = (self.goal[:2] - [x, y]) / np.linalg.norm(self.goal[:2] - [x, y])
-        turn = math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)
-        self.data.qpos[:] = [x, y, 0.05, *turn, *([x, y] + 0.12 * towards)]
+        self.guess = None
         self.policy.reset()
-
-    @staticmethod
-    def state(data: Any) -> np.ndarray:
-        """Read the state in the plane."""
-        q = data.qpos
-        return np.array([q[0], q[1], 2 * math.atan2(q[6], q[3]), q[7], q[8]])
+        self.scene.start(seed)
 
     def look(self) -> tuple[Tensor, Tensor]:
         """See `Loop`; the goal's angle is the one nearest to the box's."""
-        x = self.state(self.data)
-        goal = [*self.goal[:2], x[2] + box_to_pose.wrapped(self.goal[2] - x[2])]
-        return torch.from_numpy(x), torch.tensor(goal, dtype=torch.float64)
+        x, (*place, yaw) = self.scene.state, self.scene.goal
+        return torch.from_numpy(x), torch.tensor([*place, x[2] + box_to_pose.wrapped(yaw - x[2])], dtype=torch.float64)
 
     def plan(self) -> np.ndarray:
-        """Plan with places, or directly."""
-        return super().plan() if self.direct else self.policy.act(*self.look())
+        """See `Loop`."""
+        places = self.layer.backend.module != "simulated"  # pyright: ignore[reportAttributeAccessIssue]
+        self.layer.cost = self.cost if places else self.drawn
+        return self.policy.act(*self.look()) if places else super().plan()
 
     def move(self, u: np.ndarray) -> None:
         """See `Loop`."""
-        self.simulate(self.model, self.data, u)
-
-    def simulate(self, model: Any, data: Any, u: np.ndarray) -> None:
-        """Execute an action, in steps of this model."""
-        data.ctrl[:] = self.module.control(torch.from_numpy(self.state(data)), torch.from_numpy(u)).numpy()
-        mujoco.mj_step(model, data, round(0.1 / model.opt.timestep))
+        self.scene.step(u)
 
     def error(self) -> float:
         """See `Loop`."""
-        left = self.state(self.data)[:3] - self.goal
-        apart, turned = math.hypot(left[0], left[1]), abs(box_to_pose.wrapped(left[2]))
-        return max(apart / box_to_pose.NEAR, turned / box_to_pose.ALIGNED)
+        return self.scene.error()
 
-    def imagine(self, u: np.ndarray) -> np.ndarray:
+    def copy(self) -> np.ndarray:
         """See `Loop`."""
-        mujoco.mj_copyState(self.model, self.data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-        x = [self.state(self.tried)]
-        for action in u:
-            self.simulate(self.coarse, self.tried, action)
-            x.append(self.state(self.tried))
-        x = np.array(x)
-        x[:, 2] = np.unwrap(x[:, 2])
+        mujoco.mj_copyState(self.scene.model, self.scene.data, self.twin.data, mujoco.mjtState.mjSTATE_INTEGRATION)
+        return self.twin.state
+
+    def attempt(self, u: np.ndarray) -> np.ndarray:
+        """See `Loop`; the box turns less than half a turn in a plan."""
+        self.twin.step(u)
+        x, now = self.twin.state, self.scene.state[2]
+        x[2] = now + box_to_pose.wrapped(x[2] - now)
         return x
 
 
@@ -330,10 +299,9 @@ class Hand(Loop):
     limit, hold, pace = 100, 21, 0.5
 
     def __init__(self) -> None:
-        self.env: Any = gymnasium.make("difflcs/HandTurnObject-v0", horizon=self.limit).unwrapped
-        self.coarse, model = build_model("cube"), build_model("cube")
-        self.coarse.opt.timestep, self.tried = COARSE, mujoco.MjData(self.coarse)
-        self.module, high = hand_system(model), 0.1 * self.pace
+        self.env = gymnasium.make("difflcs/HandTurnObject-v0", horizon=self.limit).unwrapped
+        self.module, self.coarse, high = hand_system(build_model("cube")), build_model("cube"), 0.1 * self.pace
+        self.coarse.opt.timestep, self.twin = COARSE, mujoco.MjData(self.coarse)
         cost = hand_cost(self.module)
         self.layer = LCSMPCLayer(self.module, cost, 4, -high, high, relaxation=1e-3, on_failure="mask")
 
@@ -346,50 +314,50 @@ class Hand(Loop):
         lost = self.info["dropped"] or self.info.get("physics_error", False)
         return math.inf if lost else self.info["angle_error"] / 0.4
 
-    def imagine(self, u: np.ndarray) -> np.ndarray:
+    def copy(self) -> np.ndarray:
         """See `Loop`."""
-        mujoco.mj_copyState(self.env.model, self.env.data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-        x = [self.module.state.to_state(self.tried.qpos, self.tried.qvel).numpy()]
-        for action in u:
-            self.tried.ctrl[:] = self.tried.qpos[:16] + action
-            mujoco.mj_step(self.coarse, self.tried, round(0.1 / COARSE))
-            x.append(self.module.state.to_state(self.tried.qpos, self.tried.qvel).numpy())
-        return np.array(x)
+        mujoco.mj_copyState(self.coarse, self.env.data, self.twin, mujoco.mjtState.mjSTATE_INTEGRATION)
+        return self.module.state.to_state(self.twin.qpos).numpy()
+
+    def attempt(self, u: np.ndarray) -> np.ndarray:
+        """See `Loop`."""
+        self.twin.ctrl[:] = self.twin.qpos[:16] + u
+        mujoco.mj_step(self.coarse, self.twin, round(0.1 / COARSE))
+        return self.module.state.to_state(self.twin.qpos).numpy()
+
+
+TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
 
 
 # --- the race ---------------------------------------------------------------------------------------------------------
-
-TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
 
 
 def rivals(task: str) -> dict[str, tuple[str, Draw]]:
     """List the rivals of a task: module, and how random settings are drawn."""
     lcs, *simulated = ROLLOUTS[task]
-    both = ("cem", "mppi")
-    found = {
-        k: v for k, v in draws().items() if v[0] != "sampling" and "100" not in k and k not in LEFT_OUT.get(task, ())
-    }
-    found |= {f"sampling on the LCS, {lcs} rollouts": ("sampling", sampled(both, lcs))}
+    both, out = ("cem", "mppi"), ("C3+, 100 iterations", *LEFT_OUT.get(task, ()))
+    found = {label: row for label, row in draws().items() if row[0] != "sampling" and label not in out}
+    found[f"sampling on the LCS, {lcs} rollouts"] = ("sampling", sampled(both, lcs))
     return found | {f"sampling in MuJoCo, {n} rollouts": ("simulated", sampled(both, n)) for n in simulated}
 
 
 @torch.no_grad()
 def play(
-    loop: Loop, module: str, settings: dict[str, Any], seeds: range, seconds: float = math.inf, part: float = 1.0
+    loop: Loop, module: str, settings: dict[str, Any], seeds: range, seconds: float, limit: int | None = None
 ) -> dict[str, list[float]]:
-    """Play an episode, or a part of its decisions, for each seed, until the CPU time is used up.
+    """Play an episode of at most `limit` decisions for each seed, at least two, until the CPU time is used up.
 
     Returns:
         Success, cost, decisions, and milliseconds of CPU of a decision: all, what a rival prepares for each new system,
         and the solver.
     """
-    planner, rows, until = Planner(module, settings), [], time.process_time() + seconds
-    loop.take(planner)
+    loop.layer.backend = planner = Planner(module, settings, loop.imagine)
+    rows, until = [], time.process_time() + seconds
     for seed in seeds:
         if time.process_time() > until and len(rows) > 1:
             break
-        planner.seconds[:] = 0
-        success, cost, decisions, used = loop.play(seed, round(part * loop.limit))
+        planner.seconds[:], planner.solver = 0, None
+        success, cost, decisions, used = loop.play(seed, limit or loop.limit)
         rows.append([float(success), cost, decisions, *(1e3 * v / decisions for v in (used, *planner.seconds))])
     names = "success", "cost", "decisions", "all_ms", "prepare_ms", "solve_ms"
     return {name: [float(v) for v in column] for name, column in zip(names, zip(*rows, strict=True), strict=True)}
@@ -398,13 +366,12 @@ def play(
 def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dict[str, Any]:
     """Try the settings of single plans, then random ones: 20 decisions of three episodes; the best four play others."""
     random, until, tried = np.random.default_rng(0), time.process_time() + seconds, []
-    known = [family[label]["settings"] for family in json.loads(RACE_TUNED.read_text()).values() if label in family]
+    known = [family[label]["settings"] for family in json.loads(TUNED_PLANS.read_text()).values() if label in family]
+    seeds, others = range(TUNING_SEED, TUNING_SEED + 3), range(TUNING_SEED + 3, TUNING_SEED + 15)
     while time.process_time() < until or len(tried) < 3:
         settings = known.pop() if known else draw(random)
-        first = play(loop, module, settings, range(TUNING_SEED, TUNING_SEED + 3), part=20 / loop.limit)
-        tried.append((np.mean(first["cost"]), settings))
+        tried.append((np.mean(play(loop, module, settings, seeds, math.inf, 20)["cost"]), settings))
     tried.sort(key=lambda pair: pair[0])
-    others = range(TUNING_SEED + 3, TUNING_SEED + 15)
     again = [(np.mean(play(loop, module, each, others, seconds / 4)["cost"]), each) for _, each in tried[:4]]
     cost, settings = min(again, key=lambda pair: pair[0])
     print(f"{label:36s} {len(tried)} drawn, cost {cost:.3f}: {settings}", flush=True)
@@ -417,29 +384,23 @@ def main(o: Options) -> None:
     warnings.simplefilter("ignore", ContactWarning)
     difflcs_envs.register_envs()
     tuned = json.loads(TUNED.read_text()) if TUNED.exists() else {}
-    record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
+    results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for task in o.tasks:
-        loop = TASKS[task]()
-        planners: dict[str, Any] = {label: ("ours", settings) for label, settings in OURS.items()}
-        for label, (module, draw) in rivals(task).items():
-            if o.tune and (not o.only or label in o.only):
+        loop, rows = TASKS[task](), {label: {"module": "ours", "settings": each} for label, each in OURS.items()}
+        for label, (module, draw) in rivals(task).items() if o.tune else ():
+            if not o.only or label in o.only:
                 tuned.setdefault(task, {})[label] = tune(loop, label, module, draw, o.tune)
                 TUNED.write_text(json.dumps(tuned, indent=1) + "\n")
-            planners |= {label: (module, tuned[task][label]["settings"])} if not o.tune else {}
-        for label, (module, settings) in planners.items():
-            if not o.tune and (not o.only or label in o.only):
-                found = play(loop, module, settings, range(SEED, SEED + o.episodes), o.seconds)
-                record["results"].setdefault(task, {})[label] = figures(found)
-                print(f"{task:6s} {label:36s} {record['results'][task][label]}", flush=True)
-                save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, **record})
-
-
-def figures(found: dict[str, list[float]]) -> dict[str, Any]:
-    """Compute means with 95 % intervals: Wilson's of successes, normal of costs."""
-    n, won = len(found["success"]), int(sum(found["success"]))
-    half = 1.96 * float(np.std(found["cost"], ddof=1)) / math.sqrt(n) if n > 1 else math.inf
-    mean = {name: float(np.mean(values)) for name, values in found.items()}
-    return {"episodes": n, "interval": wilson_interval(won, n), "cost_half": half, **mean}
+        for label, row in (rows | tuned[task]).items() if not o.tune else ():
+            if not o.only or label in o.only:
+                found = play(loop, seeds=range(SEED, SEED + o.episodes), seconds=o.seconds, **row)
+                n, won = len(found["success"]), round(sum(found["success"]))
+                figures = {"episodes": n, "interval": wilson_interval(won, n)}
+                figures["cost_half"] = 1.96 * float(np.std(found["cost"], ddof=1)) / math.sqrt(n)
+                figures |= {name: float(np.mean(values)) for name, values in found.items()}
+                results.setdefault(task, {})[label] = figures
+                print(f"{task:6s} {label:36s} {figures}", flush=True)
+                save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "results": results})
 
 
 if __name__ == "__main__":

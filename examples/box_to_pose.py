@@ -30,7 +30,7 @@ from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingS
 from difflcs.rl import wilson_interval
 
 HALF, RADIUS = (0.07, 0.05), 0.015  # of the box's sides and of the sphere [m]
-STEPS, SUBSTEPS = 150, 50
+STEPS, SECONDS = 150, 0.1  # of an episode, of a step [s]
 NEAR, ALIGNED = 0.01, 0.1  # [m, rad]
 WEIGHT, FINAL, EFFORT = (100.0, 100.0, 0.36), (400.0, 400.0, 1.44), 3.0  # of the pose: 0.1 rad as much as 6 mm
 
@@ -84,6 +84,49 @@ def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
     return SamplingPolicy(mpc, Faces(shape, RADIUS, 64), travel, settings, angles=(2,)), module
 
 
+class Scene:
+    """The box and the sphere in space.
+
+    Args:
+        module: the system of the policy, which says what control an action is.
+        timestep: of the simulation [s].
+
+    Attributes:
+        goal: x, y [m] and yaw [rad] of the box.
+    """
+
+    def __init__(self, module: MujocoLCS, timestep: float = 0.002):
+        self.module, self.model = module, mujoco.MjModel.from_xml_string(WORLD.format(joints="<freejoint/>"))
+        self.model.opt.timestep = timestep
+        self.data, self.goal = mujoco.MjData(self.model), np.zeros(3)
+
+    def start(self, seed: int) -> None:
+        """Draw a start and a goal, with the sphere between the box and its goal."""
+        mujoco.mj_resetData(self.model, self.data)
+        random = np.random.default_rng(seed)
+        x, y, yaw = random.uniform(-1, 1, 3) * [0.1, 0.1, math.pi]
+        self.goal = random.uniform(-1, 1, 3) * [0.2, 0.2, math.pi]
+        towards = (self.goal[:2] - [x, y]) / np.linalg.norm(self.goal[:2] - [x, y])
+        turn = math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)
+        self.data.qpos[:] = [x, y, 0.05, *turn, *([x, y] + 0.12 * towards)]
+
+    @property
+    def state(self) -> np.ndarray:
+        """The state of the policy's system."""
+        q: Any = self.data.qpos
+        return np.array([q[0], q[1], 2 * math.atan2(q[6], q[3]), q[7], q[8]])
+
+    def error(self) -> float:
+        """Return the distance to the goal, 1 where the box begins to be there."""
+        left = self.state[:3] - self.goal
+        return max(math.hypot(left[0], left[1]) / NEAR, abs(wrapped(left[2])) / ALIGNED)
+
+    def step(self, u: np.ndarray) -> None:
+        """Execute an action for 0.1 s."""
+        self.data.ctrl[:] = self.module.control(torch.from_numpy(self.state), torch.from_numpy(u)).numpy()
+        mujoco.mj_step(self.model, self.data, round(SECONDS / self.model.opt.timestep))
+
+
 class Episode(NamedTuple):
     """One goal: whether it was reached, in how many steps, and seconds of CPU time for each decision."""
 
@@ -99,25 +142,16 @@ def wrapped(angle: float) -> float:
 
 def play(seed: int, policy: SamplingPolicy, module: MujocoLCS) -> Episode:
     """Start on the wrong side, and go on until the goal is reached."""
-    model = mujoco.MjModel.from_xml_string(WORLD.format(joints="<freejoint/>"))
-    data, random = mujoco.MjData(model), np.random.default_rng(seed)
-    x, y, yaw = random.uniform(-1, 1, 3) * [0.1, 0.1, math.pi]
-    goal = random.uniform(-1, 1, 3) * [0.2, 0.2, math.pi]
-    towards = (goal[:2] - [x, y]) / np.linalg.norm(goal[:2] - [x, y])
-    data.qpos[:] = [x, y, 0.05, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2), *([x, y] + 0.12 * towards)]
+    scene, used = Scene(module), 0.0
+    scene.start(seed)
     policy.reset()
-    used = 0.0
     for step in range(STEPS + 1):
-        q: Any = data.qpos
-        state = np.array([q[0], q[1], 2 * math.atan2(q[6], q[3]), q[7], q[8]])
-        error = state[:3] - goal
-        if math.hypot(error[0], error[1]) < NEAR and abs(wrapped(error[2])) < ALIGNED:
+        if scene.error() < 1:
             return Episode(True, step, used / max(step, 1))
         start = time.process_time()
-        u = policy.act(state, goal)
+        u = policy.act(scene.state, scene.goal)
         used += time.process_time() - start
-        data.ctrl[:] = module.control(torch.from_numpy(state), torch.from_numpy(u)).numpy()
-        mujoco.mj_step(model, data, SUBSTEPS)
+        scene.step(u)
     return Episode(False, STEPS, used / STEPS)
 
 

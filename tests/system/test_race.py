@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import nnls
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -103,3 +104,33 @@ def test_planners_for_contact_come_near_the_best_plan(race):
             assert (race_hard.objectives(problem, mpc, u) < (1.2 if "3 iter" in label else 1.02) * best).all(), label
     costs = [Solver(problem).costs(problem.only(i), u[i : i + 1])[0] for i in range(2)]
     np.testing.assert_allclose(costs + problem.constant, race_hard.objectives(problem, mpc, u), rtol=1e-9)
+
+
+def test_c3_projects_onto_the_nearest_point_that_complementarity_allows(race, pushing):
+    from rivals.admm import Solver
+
+    solver = Solver(pushing, iterations=1, weight=1.0, gap=0.5, project="exact", new=True)
+    M, inverses = solver.supports(pushing.F)
+    size = pushing.n_lam
+    for target in np.random.default_rng(0).standard_normal((20, 2 * size)):
+        pairs = inverses @ (target @ M)
+        allowed = pairs[(pairs >= 0).all(1)]
+        assert not (allowed[:, :size] * allowed[:, size:]).any()
+        nearest = np.linalg.norm(allowed @ M.T - target, axis=1).min()
+        modes = (M[:, [i + size * (mode >> i & 1) for i in range(size)]] for mode in range(2**size))
+        assert nearest == pytest.approx(min(nnls(mode, target)[1] for mode in modes), rel=1e-9)
+
+
+def test_a_rival_closes_the_loop_in_mujoco_and_samples_in_a_copy_of_it(race):
+    import race_loops
+
+    loop = race_loops.Cube()
+    tuned = race_loops.json.loads(race_loops.TUNED.read_text())["cube"]["C3, 10 iterations"]
+    found = race_loops.play(loop, tuned["module"], tuned["settings"], range(2000, 2003), 100.0)
+    assert max(found["cost"]) < 1  # nearer than at the start
+    loop.begin(2000)
+    actions = np.random.default_rng(0).uniform(-0.015, 0.015, (3, 6))
+    foreseen = loop.imagine(actions)
+    for action, state in zip(actions, foreseen[1:], strict=True):
+        loop.move(action)
+        np.testing.assert_array_equal(loop.seen["state"], state)
