@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from race_global import hard_cost
 from race_hard import MODULES, Draw, draws, sampled
 from race_hard import TUNED as TUNED_PLANS
 from rivals.problem import Problem
@@ -50,8 +51,9 @@ TUNED = Path(__file__).parent / "rivals" / "tuned_loops.json"
 OURS = {"difflcs": {}, 'difflcs `"fast"`': {"effort": "fast"}}
 SEED, TUNING_SEED = 5000, 3000
 COARSE = 0.005  # [s] steps of the second simulation of box and hand
-ROLLOUTS = {"cube": (256, 4, 32), "box": (64, 4, 20), "hand": (64, 4, 20)}  # on the LCS, and twice in MuJoCo
-LEFT_OUT = {"hand": ("IMPACT-like", "C3, 10 iterations, exact")}  # 10 s a decision, and 3^56 supports
+ROLLOUTS = {"cube": (256, 32), "box": (64, 20), "hand": (64, 20)}  # on the LCS, and in MuJoCo
+SLOW = "IMPACT-like", "C3, 10 iterations"  # 10 s a decision with the hand
+LEFT_OUT = {"cube": (), "box": SLOW, "hand": (*SLOW, "C3, 10 iterations, exact")}  # of 3^56 supports
 
 
 @dataclass
@@ -85,6 +87,7 @@ class Planner(Backend):
 
     Attributes:
         seconds: CPU time [s] of what it prepares for each new system, and of planning.
+        met: problems that ours was given, and its actions.
     """
 
     name = "race"
@@ -93,6 +96,7 @@ class Planner(Backend):
         self.module, self.settings, self.imagine = module, settings, imagine
         self.ours = BatchedBackend(threads=1, **settings) if module == "ours" else None
         self.solver: Any = None
+        self.met: list[tuple[MPCProblem, Tensor]] = []
         self.random, self.seconds = np.random.default_rng(0), np.zeros(2)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
@@ -101,6 +105,7 @@ class Planner(Backend):
             solve = self.ours.solve
             seconds, result = cpu(lambda: solve(problem, guess))
             self.seconds[1] += seconds
+            self.met.append((problem, result.primal.u))
             return result
         self.prepare(problem)
         if isinstance(self.solver, Sampling):
@@ -334,11 +339,11 @@ TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
 
 def rivals(task: str) -> dict[str, tuple[str, Draw]]:
     """List the rivals of a task: module, and how random settings are drawn."""
-    lcs, *simulated = ROLLOUTS[task]
-    both, out = ("cem", "mppi"), ("C3+, 100 iterations", *LEFT_OUT.get(task, ()))
+    lcs, simulated = ROLLOUTS[task]
+    both, out = ("cem", "mppi"), ("C3+, 100 iterations", *LEFT_OUT[task])
     found = {label: row for label, row in draws().items() if row[0] != "sampling" and label not in out}
     found[f"sampling on the LCS, {lcs} rollouts"] = ("sampling", sampled(both, lcs))
-    return found | {f"sampling in MuJoCo, {n} rollouts": ("simulated", sampled(both, n)) for n in simulated}
+    return found | {f"sampling in MuJoCo, {simulated} rollouts": ("simulated", sampled(both, simulated))}
 
 
 @torch.no_grad()
@@ -363,16 +368,34 @@ def play(
     return {name: [float(v) for v in column] for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
+@torch.no_grad()
 def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dict[str, Any]:
-    """Try the settings of single plans, then random ones: 20 decisions of three episodes; the best four play others."""
+    """Try settings for some CPU seconds, those of single plans, then random ones; the best three play for as long.
+
+    They are compared by the costs of their plans under hard contact for problems that ours meets in three episodes, in
+    parts of what doing nothing costs more than ours; sampling in MuJoCo by 20 decisions of these episodes.
+    """
+    first, others = range(TUNING_SEED, TUNING_SEED + 3), range(TUNING_SEED + 3, TUNING_SEED + 23)
+    play(loop, "ours", {}, first, math.inf, 20)
+    met = [(problem.select(torch.arange(0, len(u), 16)), u[::16]) for problem, u in loop.layer.backend.met[::6]]
+    ours, idle = (torch.cat([hard_cost(problem, part * u) for problem, u in met]) for part in (1, 0))
+    gain = (idle - ours).clamp_min(0.1 * float((idle - ours).mean()))
+
+    def score(settings: dict[str, Any]) -> float:
+        if module == "simulated":
+            return float(np.mean(play(loop, module, settings, first, math.inf, 20)["cost"]))
+        plans = [Planner(module, settings, loop.imagine).solve(problem, None).primal.u for problem, _ in met]
+        costs = torch.cat([hard_cost(problem, u) for (problem, _), u in zip(met, plans, strict=True)])
+        return float(((costs - ours) / gain).nan_to_num(3.0).clamp(-1.0, 3.0).mean())
+
     random, until, tried = np.random.default_rng(0), time.process_time() + seconds, []
     known = [family[label]["settings"] for family in json.loads(TUNED_PLANS.read_text()).values() if label in family]
-    seeds, others = range(TUNING_SEED, TUNING_SEED + 3), range(TUNING_SEED + 3, TUNING_SEED + 15)
     while time.process_time() < until or len(tried) < 3:
         settings = known.pop() if known else draw(random)
-        tried.append((np.mean(play(loop, module, settings, seeds, math.inf, 20)["cost"]), settings))
+        tried.append((score(settings), settings))
     tried.sort(key=lambda pair: pair[0])
-    again = [(np.mean(play(loop, module, each, others, seconds / 4)["cost"]), each) for _, each in tried[:4]]
+    half = max(20, loop.limit // 2)
+    again = [(np.mean(play(loop, module, each, others, seconds / 3, half)["cost"]), each) for _, each in tried[:3]]
     cost, settings = min(again, key=lambda pair: pair[0])
     print(f"{label:36s} {len(tried)} drawn, cost {cost:.3f}: {settings}", flush=True)
     return {"module": module, "settings": settings}
