@@ -182,17 +182,9 @@ class Loop:
         """Return the distance to the goal, 1 where it begins to count as reached; inf: the object is lost."""
         raise NotImplementedError
 
-    def copy(self) -> np.ndarray:
-        """Bring the second simulation to where the robot is; return its state."""
-        raise NotImplementedError
-
-    def attempt(self, u: np.ndarray) -> np.ndarray:
-        """Execute an action there; return the state after it."""
-        raise NotImplementedError
-
     def imagine(self, u: np.ndarray) -> np.ndarray:
         """Simulate actions (H, n_u) from where the robot is: states (H+1, n_x)."""
-        return np.array([self.copy(), *map(self.attempt, u)])
+        raise NotImplementedError
 
     def play(self, seed: int, limit: int) -> tuple[bool, float, int, float]:
         """Play an episode: success, cost, decisions, and their CPU time [s].
@@ -230,17 +222,14 @@ class Cube(Loop):
         task = self.env.task
         return max(self.info["position_error"] / task.position_tolerance, self.info["yaw_error"] / task.yaw_tolerance)
 
-    def copy(self) -> np.ndarray:
-        """See `Loop`."""
-        self.twin.set_full_state(self.env.physics.get_full_state())
-        self.state = self.seen["state"]
-        return self.state
-
-    def attempt(self, u: np.ndarray) -> np.ndarray:
+    def imagine(self, u: np.ndarray) -> np.ndarray:
         """See `Loop`; where it becomes unstable it stays."""
-        after = self.twin.step(u)
-        self.state = self.state if after is None else after
-        return self.state
+        self.twin.set_full_state(self.env.physics.get_full_state())
+        x = [self.seen["state"]]
+        for action in u:
+            after = self.twin.step(action)
+            x.append(x[-1] if after is None else after)
+        return np.array(x)
 
 
 class Box(Loop):
@@ -285,16 +274,15 @@ class Box(Loop):
         """See `Loop`."""
         return self.scene.error()
 
-    def copy(self) -> np.ndarray:
+    def imagine(self, u: np.ndarray) -> np.ndarray:
         """See `Loop`."""
         mujoco.mj_copyState(self.scene.model, self.scene.data, self.twin.data, mujoco.mjtState.mjSTATE_INTEGRATION)
-        return self.twin.state
-
-    def attempt(self, u: np.ndarray) -> np.ndarray:
-        """See `Loop`; the box turns less than half a turn in a plan."""
-        self.twin.step(u)
-        x, now = self.twin.state, self.scene.state[2]
-        x[2] = now + box_to_pose.wrapped(x[2] - now)
+        x = [self.twin.state]
+        for action in u:
+            self.twin.step(action)
+            x.append(self.twin.state)
+        x = np.array(x)
+        x[:, 2] = np.unwrap(x[:, 2])
         return x
 
 
@@ -319,16 +307,15 @@ class Hand(Loop):
         lost = self.info["dropped"] or self.info.get("physics_error", False)
         return math.inf if lost else self.info["angle_error"] / 0.4
 
-    def copy(self) -> np.ndarray:
+    def imagine(self, u: np.ndarray) -> np.ndarray:
         """See `Loop`."""
         mujoco.mj_copyState(self.coarse, self.env.data, self.twin, mujoco.mjtState.mjSTATE_INTEGRATION)
-        return self.module.state.to_state(self.twin.qpos).numpy()
-
-    def attempt(self, u: np.ndarray) -> np.ndarray:
-        """See `Loop`."""
-        self.twin.ctrl[:] = self.twin.qpos[:16] + u
-        mujoco.mj_step(self.coarse, self.twin, round(0.1 / COARSE))
-        return self.module.state.to_state(self.twin.qpos).numpy()
+        qpos = [self.twin.qpos.copy()]
+        for action in u:
+            self.twin.ctrl[:] = self.twin.qpos[:16] + action
+            mujoco.mj_step(self.coarse, self.twin, round(0.1 / COARSE))
+            qpos.append(self.twin.qpos.copy())
+        return self.module.state.to_state(np.array(qpos)).numpy()
 
 
 TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
