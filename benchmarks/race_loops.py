@@ -337,7 +337,7 @@ def rivals(task: str) -> dict[str, tuple[str, Draw]]:
 def play(
     loop: Loop, module: str, settings: dict[str, Any], seeds: range, seconds: float, limit: int | None = None
 ) -> dict[str, list[float]]:
-    """Play an episode of at most `limit` decisions for each seed, at least two, until the CPU time is used up.
+    """Play an episode of at most `limit` decisions for each seed, at least one, until the CPU time is used up.
 
     Returns:
         Success, cost, decisions, and milliseconds of CPU of a decision: all, what a rival prepares for each new system,
@@ -346,7 +346,7 @@ def play(
     loop.layer.backend = planner = Planner(module, settings, loop.imagine)
     rows, until = [], time.process_time() + seconds
     for seed in seeds:
-        if time.process_time() > until and len(rows) > 1:
+        if time.process_time() > until and rows:
             break
         planner.seconds[:], planner.solver = 0, None
         success, cost, decisions, used = loop.play(seed, limit or loop.limit)
@@ -379,6 +379,8 @@ def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dic
     known = [family[label]["settings"] for family in json.loads(TUNED_PLANS.read_text()).values() if label in family]
     while time.process_time() < until or len(tried) < 3:
         settings = known.pop() if known else draw(random)
+        if "growth" in settings and not isinstance(loop, Cube):
+            settings["growth"] = 1.0  # else there is a factor for each iteration of each new system
         tried.append((score(settings), settings))
     tried.sort(key=lambda pair: pair[0])
     half = max(20, loop.limit // 2)
