@@ -38,7 +38,7 @@ from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
+from difflcs.physics.mujoco import ContactGroup, Effort, MujocoCost, MujocoLCS, Orientation, Position
 
 OBJECTS = {  # place of the start [m], its height, and the target place, as published
     "airplane": ((-0.03, -0.01), 0.03, (-0.02, -0.01, 0.03)),
@@ -70,7 +70,7 @@ LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS, OPENING = 500, 21, 50, 0.005, 0.1,
 class Settings:
     """Of the controller, the same for all objects."""
 
-    horizon: int = 3
+    horizon: int = 2
     friction: float = 0.5
     inertia: float = 5.0
     """Factor of the inertia of rotation."""
@@ -81,8 +81,9 @@ class Settings:
     turn: float = 18.75
     reach: float = 0.5
     """Angle up to which a goal that is farther away pulls harder [rad]."""
-    near: float = 1.0
-    """Weight of the distances of object and fingertips."""
+    near: float = 8.0
+    """Weight of the distances of fingertips from what they are to touch: the middle of the object, and after the hand
+    has opened points that are drawn in its box."""
     effort: float = 0.2
     patience: int = 25
     """Decisions without progress after which the hand opens, and takes the object anew."""
@@ -90,6 +91,8 @@ class Settings:
     """Part of the published limit of actions that is used, as drops come from fast motion."""
     paces: tuple[float, ...] = (2.0, 0.7)
     """Factors by which the planned step is tried in MuJoCo, the fastest first; none: it is executed untried."""
+    gain: float = 0.1
+    """Cost by which a step has to end better than now for no slower one to be tried."""
     slack: float = 0.02
     """Cost by which a faster step may end worse than the best."""
     worse: float = 4.0
@@ -160,7 +163,8 @@ class HandPolicy:
     def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
         s = settings
         self.twin, self.place, model = copy.copy(model), place, copy.copy(model)
-        self.twin.opt.timestep = SECONDS / TRIALS
+        self.twin.opt.timestep, self.twin.opt.impratio = SECONDS / TRIALS, 1.0
+        self.twin.geom_condim[:] = np.minimum(self.twin.geom_condim, 4)  # nothing rolls far
         self.tried = mujoco.MjData(self.twin)
         model.body_inertia[model.body("obj").id] *= s.inertia
         mujoco.mj_setConst(model, mujoco.MjData(model))  # simple bodies have it twice
@@ -179,13 +183,14 @@ class HandPolicy:
             friction=s.friction,
             compliance=s.compliance,
             length=0.02,
+            limits=0,  # actions are within them already
         )
         cost = MujocoCost(
             self.module,
             [
-                Position("body:obj", place, weight=0.0, weight_final=s.place),
+                Position("body:obj", weight=0.0, weight_final=s.place),
                 Orientation("body:obj", weight=0.0, weight_final=s.turn, reach=s.reach),
-                *(Distance("obj", f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)),
+                *(Position(f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)),
                 Effort(s.effort),
             ],
         )
@@ -193,6 +198,7 @@ class HandPolicy:
         self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
         self.settings, self.times = settings, []
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
+        self.geom, self.spots = model.geom("obj").id, np.zeros((4, 3))
         self.aim(goal)
 
     def aim(self, goal: np.ndarray) -> None:
@@ -212,6 +218,7 @@ class HandPolicy:
         if self.waited > self.settings.patience:
             self.best, self.waited = np.inf, -OPENING
             self.posture = self.draw(0.0 if self.posture is None else 0.3)
+            self.spots = self.random.uniform(-1, 1, (4, 3)) * self.twin.geom_aabb[self.geom, 3:]
         return self.waited < 0
 
     def draw(self, spread: float) -> np.ndarray:
@@ -222,25 +229,29 @@ class HandPolicy:
         """MuJoCo's ctrl for the next 0.1 s."""
         if self.stalls(data):
             self.mpc.reset()
-            last, ctrl = self.ctrl, self.rehearse(data, self.posture, (1.0,))
+            last, ctrl = self.ctrl, self.rehearse(data, self.posture - data.qpos[:16], (1.0,))
             if ctrl is last:  # to open in this way does harm
                 self.posture = self.draw(0.3)
             return ctrl
         marks = [time.thread_time()]
-        x = self.module.observe(data)
-        action = torch.from_numpy(self.mpc.step(x, self.goal))  # which asks module and cost
+        grips = data.geom_xpos[self.geom] + self.spots @ data.geom_xmat[self.geom].reshape(3, 3).T
+        goal = np.concatenate([self.place, self.goal, *grips])
+        action = self.mpc.step(self.module.observe(data), goal)  # which asks module and cost
         marks.append(time.thread_time())
-        ctrl = self.rehearse(data, self.module.control(x, action).numpy(), self.settings.paces)
+        ctrl = self.rehearse(data, action, self.settings.paces)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         return ctrl
 
-    def rehearse(self, data: Any, ctrl: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
+    def rehearse(self, data: Any, action: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
         """Try a step at several paces in MuJoCo: the fastest that ends about as well as the best, or none."""
-        s, joints = self.settings, data.qpos[:16]
-        tries = [joints + np.clip(pace * (ctrl - joints), -self.limit, self.limit) for pace in paces or (1.0,)]
-        ends = [self.simulate(data, tried) for tried in tries] if s.paces else [0.0]
-        if s.paces and min(ends) > self.miss(data) + s.worse:
+        s, now, tries, ends = self.settings, self.miss(data), [], []
+        for pace in paces or (1.0,):
+            tries.append(data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit))
+            ends.append(self.simulate(data, tries[-1]) if s.paces else now)
+            if ends[-1] < now - s.gain:
+                break
+        if min(ends) > now + s.worse:
             tries.append(self.ctrl)
             ends.append(self.simulate(data, self.ctrl))
         self.ctrl = next(tried for tried, end in zip(tries, ends, strict=True) if end <= min(ends) + s.slack)

@@ -191,10 +191,34 @@ def contact_lcs(
     n_x, n_contacts, n_tangents = x.shape[-1], contacts.gap.shape[-1], contacts.tangent.shape[-2]
     _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
     _check_more(unilateral, bounded, n_x)
-    more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
     mu = _per_row("friction", friction, contacts.gap, strict=False)
-    of_all = contacts.gap.new_empty(n_contacts + sum(m[0].shape[-1] for m in more))
+    others = sum(m[0].shape[-1] for m in (unilateral, bounded) if m is not None)
+    of_all = contacts.gap.new_empty(n_contacts + others)
     soft = _per_row("compliance", compliance, of_all, strict=True) * (force / length)
+    return LCSParams(**assemble_lcs(contacts, free, x, mu, soft, cone, length, force, rest, unilateral, bounded))
+
+
+def assemble_lcs(
+    contacts: Contacts,
+    free: FreeMotion,
+    x: Tensor,
+    mu: Tensor,
+    soft: Tensor,
+    cone: Cone,
+    length: float,
+    force: float,
+    rest: Tensor | None = None,
+    unilateral: Unilateral | None = None,
+    bounded: Bounded | None = None,
+) -> dict[str, Tensor]:
+    """Compute the matrices of `contact_lcs`, whose arguments these are, by name; nothing is checked.
+
+    Args:
+        mu: (..., n_contacts) friction.
+        soft: (..., n) compliance of each contact, one-sided constraint and bounded force, in units of length / force.
+    """
+    n_contacts, n_tangents = contacts.gap.shape[-1], contacts.tangent.shape[-2]
+    more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
     stewart_trinkle = cone == "stewart-trinkle" and n_tangents > 0 and n_contacts > 0
     directions = _normals_and_tangents if stewart_trinkle else _rays
     rows, normals, gap = directions(contacts, mu) if n_tangents else (contacts.normal, contacts.normal, contacts.gap)
@@ -221,7 +245,7 @@ def contact_lcs(
         system = _limit_friction(system, mu, each, forces)
     if bounded is not None and bounded.offset.shape[-1]:
         system = _bound(system, bounded.lower / force, bounded.upper / force)
-    return LCSParams(A=free.A, B=free.B, **system._asdict())
+    return {"A": free.A, "B": free.B, **system._asdict()}
 
 
 class _Rows(NamedTuple):

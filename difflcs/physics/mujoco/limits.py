@@ -117,6 +117,7 @@ class RowFinder:
         self.model, self.data = model, data
         disabled = model.opt.disableflags
         limits_act, rubs = (not disabled & flags("CONSTRAINT", name) for name in ("LIMIT", "FRICTIONLOSS"))
+        limits_act = limits_act and limits != 0
         limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE)) & limits_act
         self._joints = np.flatnonzero(limited & (model.jnt_type >= _SLIDE))
         self._balls = np.flatnonzero(limited & (model.jnt_type == _BALL))
@@ -163,6 +164,9 @@ class RowFinder:
             InvalidInputError: MuJoCo raised an error.
         """
         n, nv = place.shape
+        if not (self.n_limits or self.n_friction):
+            none = np.zeros((n, 0))
+            return Rows(none, np.zeros((n, 0, nv)), none, self._soft.at(np.zeros((n, 0), int)), 0)
         normal, gap, bend, tendons = self._limits(qpos, place, middle)
         where = np.arange(n)[:, None]
         chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
@@ -249,6 +253,8 @@ def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: fl
         give: how far contacts move by it.
         seconds: duration of the step [s], for bounds of impulses; 1 for those of forces.
     """
+    if not rows.gap.shape[1]:
+        return ScaledRows(rows.gap, rows.normal, rows.normal, rows.gap, rows.gap)
     gives = give_way(rows.normal, response)
     least = 1e-9 * (rows.normal**2).sum(-1) * np.trace(response, axis1=-2, axis2=-1)[:, None]
     unit = np.where(gives > least, np.sqrt(give / np.where(gives > least, gives, 1.0)), 0.0) / part

@@ -146,6 +146,8 @@ class MujocoState:
         qpos = self._references(numbers.shape[:-1]).copy()
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
+            if not numbers[..., v : v + 3].any():
+                continue  # nothing has turned
             qpos[..., q : q + 4] = _multiply(qpos[..., q : q + 4], _quaternion(numbers[..., v : v + 3]))
         velocity = np.zeros((*numbers.shape[:-1], self.nv))
         if self.velocities:
