@@ -211,11 +211,10 @@ def assemble_lcs(
     unilateral: Unilateral | None = None,
     bounded: Bounded | None = None,
 ) -> dict[str, Tensor]:
-    """Compute the matrices of `contact_lcs`, whose arguments these are, by name; nothing is checked.
+    """Compute the matrices of `contact_lcs` by name, of its arguments; nothing is checked.
 
-    Args:
-        mu: (..., n_contacts) friction.
-        soft: (..., n) compliance of each contact, one-sided constraint and bounded force, in units of length / force.
+    There is friction `mu` (..., n_contacts), and `soft` (..., n), the compliance of each contact, one-sided constraint
+    and bounded force in units of length / force.
     """
     n_contacts, n_tangents = contacts.gap.shape[-1], contacts.tangent.shape[-2]
     more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
