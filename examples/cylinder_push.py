@@ -36,8 +36,8 @@ from difflcs.rl import wilson_interval
 
 SECONDS, DECISIONS = 0.1, 200  # of a step [s], of an episode
 CLOSE, REACHED = 0.02, 0.3  # to the origin, where we and where Judo count the cylinder as being there [m]
-WEIGHT, EFFORT, FINAL = 0.01, 0.0005, 30.0  # of the distance between the two, of the servos, and at the end
-SETTINGS = SamplingSettings(travel_price=0.001, switch_price=0.002, smallest_gain=0.002)
+WEIGHT, EFFORT, FINAL = 0.001, 0.00005, 30.0  # of the distance between the two, of the servos, and at the end
+SETTINGS = SamplingSettings(keep=0.8, travel_price=0.001, switch_price=0.002, smallest_gain=0.002)
 
 
 @dataclass
@@ -68,9 +68,9 @@ def make_policy(model: Any) -> tuple[MujocoLCS, SamplingPolicy]:
     Q = torch.diag(torch.tensor([0, 0, 2, 2, 0.02, 0.02, 0.02, 0.02], dtype=torch.float64)) + WEIGHT * apart.mT @ apart
     none = torch.zeros(8, 2, dtype=torch.float64)
     cost = GoalCost(Q, EFFORT * torch.eye(2, dtype=torch.float64), FINAL * Q, none, none)
-    mpc = LCSMPCLayer(module, cost, 10, -1.0, 1.0, on_failure="mask", relaxation=1e-4)
-    places = BodyPlaces(module, "cart", ["pusher"], gap=0.06, reach=0.3)
-    travel = BodyTravel(places, clearance=0.25, tolerance=0.08, step=1.0)
+    mpc = LCSMPCLayer(module, cost, 10, -1.0, 1.0, on_failure="mask", relaxation=1e-5)
+    places = BodyPlaces(module, "cart", ["pusher"], gap=0.04, reach=0.3)
+    travel = BodyTravel(places, clearance=0.2, tolerance=0.04, step=1.0)
     return module, SamplingPolicy(mpc, places, travel, SETTINGS)
 
 
