@@ -4,8 +4,8 @@
 
 namespace difflcs::DIFFLCS_ISA {
 constexpr int kLanes = DIFFLCS_LANES;
-// Whether problems with separate matrices also have variants for the sizes of the paper's tasks.
-#ifdef DIFFLCS_FEWER_VARIANTS
+// Whether problems with separate matrices also have variants for the sizes of the paper's tasks; a controller has one.
+#if defined(DIFFLCS_FEWER_VARIANTS) || defined(DIFFLCS_C_LIBRARY)
 constexpr bool kSizedPerElement = false;
 #else
 constexpr bool kSizedPerElement = kLanes > 1;

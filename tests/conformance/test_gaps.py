@@ -1,14 +1,10 @@
 """A few hundred scenes of the campaign of gaps, and what two shapes alone do not show."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from difflcs.physics.mujoco import MujocoLCS
 from tests.conformance import gaps
 

@@ -1,11 +1,7 @@
 """A few hundred scenes of the campaign of random models."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.conformance import scenes
 
 

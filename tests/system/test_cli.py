@@ -505,7 +505,7 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
 def test_resume_after_kill_9(capsys, tmp_path):
     """Killed in the warm-up, resumed, killed in the main phase, resumed."""
     options = ["--method", "lcs-rl", "--minutes", "1.1", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
-    options += "--ppo.steps 2 --warmup.epochs.first 20 --models.rollouts 20 --models.iterations 2".split()
+    options += "--ppo.steps 2 --warmup.epochs.first 20 --models.rollouts 4 --models.iterations 1".split()
     options += ["--final-goals", "0", "--evaluate-at"]
     through, killed = tmp_path / "through", tmp_path / "killed"
     for resume, until in ((False, 1), (True, 4)):

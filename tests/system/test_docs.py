@@ -7,9 +7,7 @@ import importlib
 import importlib.util
 import io
 import itertools
-import multiprocessing
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
@@ -19,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from tests.system.forks import run_code
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -47,34 +47,22 @@ def generated():
     return module
 
 
-# Forks of a process that has imported what takes seconds, and nothing of us.
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["torch", "torchrl.data", "gymnasium", "mujoco", "casadi"])
-
-
-def run_code(code: list[str], folder: Path) -> None:
-    """Run blocks in a process and a folder of their own: they may register what they want, and read nothing of ours."""
-    script, said = folder / "page.py", folder / "said"
-    head = f"import os\nos.chdir({str(folder)!r})\nos.dup2(os.open({str(said)!r}, os.O_CREAT | os.O_WRONLY), 2)\n"
-    script.write_text(head + "import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))
-    process = FORKS.Process(target=runpy.run_path, args=(str(script),), kwargs={"run_name": "__main__"})
-    process.start()
-    process.join(600)
-    assert process.exitcode == 0, said.read_text()[-3000:]
-    for line in said.read_text().splitlines():
+def run_page(code: list[str], folder: Path) -> None:
+    """Run blocks of a page, which mentions all warnings."""
+    for line in run_code(code, folder).splitlines():
         assert "difflcs" not in line, f"a warning that the page does not mention: {line}"
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python") and p != CONTRIBUTING], ids=name)
 def test_the_python_of_a_page_runs(page, tmp_path):
-    run_code([code for code in blocks(page, "python") if not SKIP.match(code)], tmp_path)
+    run_page([code for code in blocks(page, "python") if not SKIP.match(code)], tmp_path)
 
 
 @pytest.mark.parametrize("what", ["backend", "task", "method"])
 def test_what_is_added_by_a_page_works_by_itself(what, tmp_path):
     (section,) = re.findall(rf"^## Add a {what}\n(.*?)(?=^## )", CONTRIBUTING.read_text(), re.MULTILINE | re.DOTALL)
     (code,) = [code for kind, code in FENCE.findall(section) if kind == "python"]
-    run_code([code], tmp_path)
+    run_page([code], tmp_path)
 
 
 CALL_OF_THE_KERNEL = """

@@ -7,7 +7,6 @@ import io
 import json
 import random
 import signal
-import socket
 import subprocess
 import sys
 import tarfile
@@ -49,10 +48,15 @@ class Server(http.server.BaseHTTPRequestHandler):
     requests = 0
     status = 200
     length = None  # said instead of the true one
+    raw = None  # makes the pieces of an answer that is sent as it is
 
     def do_GET(self):
         cls = type(self)
         cls.requests += 1
+        if cls.raw:
+            with contextlib.suppress(OSError):
+                self.wfile.writelines(cls.raw())
+            return
         if cls.status != 200:
             self.send_error(cls.status)
             return
@@ -183,31 +187,6 @@ def test_more_than_an_archive_can_have_is_refused(server, tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == []
 
 
-@contextlib.contextmanager
-def raw_server(*answers):
-    """Sends bytes as they are, one answer for each connection, the last one again and again."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def serve():
-            for i in range(100):
-                try:
-                    connection, _ = listener.accept()
-                except OSError:
-                    return
-                with connection, contextlib.suppress(OSError):
-                    connection.recv(10_000)
-                    for piece in answers[min(i, len(answers) - 1)]:
-                        connection.sendall(piece)
-                    connection.shutdown(socket.SHUT_WR)
-                    connection.recv(10_000)
-
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}/{{code}}.tgz"
-        listener.shutdown(socket.SHUT_RDWR)
-        thread.join(5)
-
-
 OK = b"HTTP/1.1 200 OK\r\n"
 
 
@@ -221,13 +200,14 @@ OK = b"HTTP/1.1 200 OK\r\n"
      b"HTTP/1.1 204 No\r\n\r\n", OK + b"\r\n"],
     ids=lambda answer: repr(answer[:40]),
 )  # fmt: skip
-def test_answers_that_are_no_http(tmp_path, answer):
-    with raw_server([answer]) as url, pytest.raises(AssetError):
-        assets.download(["sugar_box"], tmp_path, url)
+def test_answers_that_are_no_http(server, tmp_path, answer):
+    server.raw = lambda: [answer]
+    with pytest.raises(AssetError):
+        fetch(server, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} <= {ARCHIVE + ".part"}
 
 
-def test_a_server_that_drips_is_given_up(tmp_path, monkeypatch):
+def test_a_server_that_drips_is_given_up(server, tmp_path, monkeypatch):
     monkeypatch.setattr(assets, "MAX_SECONDS", 0.2)
 
     def drip():
@@ -236,9 +216,9 @@ def test_a_server_that_drips_is_given_up(tmp_path, monkeypatch):
             time.sleep(0.05)
             yield b"x"
 
-    start = time.monotonic()
-    with raw_server(drip(), drip(), drip()) as url, pytest.raises(AssetError, match=r"still going on after 0.2 s"):
-        assets.download(["sugar_box"], tmp_path, url)
+    server.raw, start = drip, time.monotonic()
+    with pytest.raises(AssetError, match=r"still going on after 0.2 s"):
+        fetch(server, tmp_path)
     assert time.monotonic() - start < 20
 
 

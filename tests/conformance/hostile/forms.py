@@ -15,6 +15,7 @@ from difflcs.errors import DiffLCSError
 from tests.conformance import judges
 from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
+from tests.conformance.hostile.generators import by_name
 from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, quiet, refused_one_by_one
 from tests.conformance.varied import programs
 from tests.conformance.varied.generators import random_case
@@ -281,16 +282,8 @@ def untouched(form: Case, rng: Generator, gradients: bool) -> Outcome:
     return Outcome(both[0][4].astype(int), {"untouched": np.where(changed & ~spoilt, np.inf, 0.0)})
 
 
-FORM_CLASSES: dict[str, Callable[..., Case]] = {
-    "form-plain": plain,
-    "form-no-contact": no_contact,
-    "form-zero-rows": zero_rows,
-    "form-opposite-rows": opposite_rows,
-    "form-prices": prices,
-    "form-limits": limits,
-    "form-first-stage": first_stage,
-    "form-not-numbers": not_numbers,
-    "form-extreme": extreme,
-    "form-vertex": vertex,
-}
+FORM_CLASSES: dict[str, Callable[..., Case]] = by_name(
+    plain, no_contact, zero_rows, opposite_rows, prices, limits, first_stage, not_numbers, extreme, vertex,
+    prefix="form-",
+)  # fmt: skip
 FORM_TARGETS = {"batched": form_target(), "warm": form_target(warm=True), "untouched": untouched}

@@ -434,37 +434,21 @@ def _bound(problem: Loss) -> float:
     return float(np.linalg.eigvalsh(problem.F + problem.F.T)[0])
 
 
+def by_name(*functions: Callable, prefix: str = "") -> dict[str, Callable]:
+    """Classes of problems, named like the functions that generate them."""
+    return {prefix + function.__name__.replace("_", "-"): function for function in functions}
+
+
 LCP_CLASSES: dict[str, Callable[..., LCP]] = {
-    "lcp-plain": lcp_plain,
+    **by_name(lcp_plain),
     **{f"lcp-skew-1e-{k}": skew(10.0**-k) for k in (2, 4, 6, 8, 10, 12)},
-    "lcp-nearly-singular": lcp_nearly_singular,
-    "lcp-graded": lcp_graded,
-    "lcp-scaled": lcp_scaled,
-    "lcp-degenerate": lcp_degenerate,
-    "lcp-extreme-q": lcp_extreme_q,
-    "lcp-p-matrix": lcp_p_matrix,
-    "lcp-large": lcp_large,
-    "lcp-not-definite": lcp_not_definite,
+    **by_name(lcp_nearly_singular, lcp_graded, lcp_scaled, lcp_degenerate),
+    **by_name(lcp_extreme_q, lcp_p_matrix, lcp_large, lcp_not_definite),
 }
 MPC_CLASSES: dict[str, Callable[..., Case]] = {
-    "mpc-plain": mpc_plain,
+    **by_name(mpc_plain),
     **{f"mpc-skew-1e-{k}": skew_mpc(10.0**-k) for k in (2, 4, 6, 8)},
-    "mpc-stiff": mpc_stiff,
-    "mpc-flat": mpc_flat,
-    "mpc-flat-contact": mpc_flat_contact,
-    "mpc-flat-tiny": mpc_flat_tiny,
-    "mpc-no-effect": mpc_no_effect,
-    "mpc-unstable": mpc_unstable,
-    "mpc-number-bounds": mpc_number_bounds,
-    "mpc-touching": mpc_touching,
-    "mpc-units": mpc_units,
-    "mpc-cost-scale": mpc_cost_scale,
-    "mpc-stuck": mpc_stuck,
-    "mpc-extreme": mpc_extreme,
+    **by_name(mpc_stiff, mpc_flat, mpc_flat_contact, mpc_flat_tiny, mpc_no_effect, mpc_unstable, mpc_number_bounds),
+    **by_name(mpc_touching, mpc_units, mpc_cost_scale, mpc_stuck, mpc_extreme),
 }
-LOSS_CLASSES: dict[str, Callable[..., Loss]] = {
-    "loss-plain": loss_plain,
-    "loss-at-bound": loss_at_bound,
-    "loss-scales": loss_scales,
-    "loss-tiny-gamma": loss_tiny_gamma,
-}
+LOSS_CLASSES: dict[str, Callable[..., Loss]] = by_name(loss_plain, loss_at_bound, loss_scales, loss_tiny_gamma)

@@ -1,14 +1,11 @@
 """The quick tier of the campaign: every class over every target, nothing wrong in silence, and not by refusing."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 from difflcs.mpc.backends import BatchedBackend
 from tests.conformance import judges
 from tests.conformance.hostile import campaign, checks, forms, generators, targets
