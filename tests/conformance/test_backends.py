@@ -24,7 +24,7 @@ BACKENDS = available_backends()
 EXACT = tuple(name for name in BACKENDS if get_backend(name).exact)
 
 every_problem = pytest.mark.parametrize("name", PROBLEMS)
-every_plain_problem = pytest.mark.parametrize("name", [f.__name__ for f in problems.PLAIN])
+every_plain_problem = pytest.mark.parametrize("name", problems.PLAIN)
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_exact = pytest.mark.parametrize("backend", EXACT)
 # 34 copies of every problem: seconds for a solver that takes milliseconds for one.
@@ -132,7 +132,7 @@ def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(buil
             assert bool((other >= sol.objective - 1e-7 * (1 + sol.objective.abs())).all())
 
 
-@pytest.mark.parametrize("name", [f.__name__ for f in problems.CONSTRAINED])
+@pytest.mark.parametrize("name", problems.CONSTRAINED)
 @every_exact
 def test_constraints_hold_or_are_paid_for(solutions, name, backend):
     problem, sol = solutions(name, backend)
