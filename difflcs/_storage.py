@@ -284,7 +284,7 @@ def check_tensors(
     if different := sorted(k for k in {*actual, *wanted} if actual.get(k) != wanted.get(k)):
         name = different[0]
         raise CheckpointError(
-            f"{source}: expected {what} that fits its configuration, got others in {short(different)}: {name} is "
+            f"{source}: expected {what} of the sizes in its configuration, got others in {short(different)}: {name} is "
             f"{actual.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
         )
     check_finite(source, got)

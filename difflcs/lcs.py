@@ -268,17 +268,10 @@ class LCSModel(PredictiveModule):
                 )
         except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
-        wanted_shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
+        shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
         if "action_support" in tensors:
-            wanted_shapes["action_support"] = (2, n_u)
-        shapes = {k: tuple(v.shape) for k, v in tensors.items()}
-        if shapes != wanted_shapes:
-            raise CheckpointError(
-                f"{source}: expected tensors {wanted_shapes}, got {shapes}; the file is foreign or corrupt"
-            )
-        for name, tensor in tensors.items():
-            if tensor.dtype != dtype or not bool(torch.isfinite(tensor).all()):
-                raise CheckpointError(f"{source}: expected finite {dtype} values in {name}, got {describe(tensor)}")
+            shapes["action_support"] = (2, n_u)
+        _storage.check_tensors(source, "a model", tensors, {name: (shape, dtype) for name, shape in shapes.items()})
         support = tensors.get("action_support")
         try:
             model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype, action_support=support)

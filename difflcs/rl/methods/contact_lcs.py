@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from difflcs import _storage
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import get_backend
@@ -90,13 +91,8 @@ class ContactMethod(Method):
                 f"{source}: expected what is known of task {task.name} to be as when it was learned, got another "
                 f"physics; is the object's mesh there in one place, and a stand-in in the other?"
             )
-        state = lcs.state_dict()
-        shapes = {name: tuple(value.shape) for name, value in state.items()}
-        if shapes != {name: tuple(value.shape) for name, value in tensors.items()}:
-            raise CheckpointError(f"{source}: expected tensors {shapes}, got others; the file is foreign or corrupt")
-        for name, value in tensors.items():
-            if value.dtype != state[name].dtype or not bool(torch.isfinite(value).all()):
-                raise CheckpointError(f"{source}: expected finite {state[name].dtype} values in {name}; is it damaged?")
+        wanted = {name: (tuple(value.shape), value.dtype) for name, value in lcs.state_dict().items()}
+        _storage.check_tensors(source, "tensors", tensors, wanted)
         lcs.load_state_dict(dict(tensors))
         return lcs
 
