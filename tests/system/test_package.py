@@ -13,7 +13,7 @@ import difflcs
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = (
     "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
-    "trimesh", "coacd", "numba", "filelock", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
+    "trimesh", "coacd", "numba", "filelock", "pooch", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
 )  # fmt: skip
 
 

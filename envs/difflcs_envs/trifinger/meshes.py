@@ -8,7 +8,6 @@ import io
 import json
 import os
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from difflcs_envs.errors import MeshError, MissingDependencyError
+from difflcs_envs.locks import one_at_a_time
 
 if TYPE_CHECKING:
     import trimesh
@@ -323,33 +323,12 @@ def _convex_parts(mesh: trimesh.Trimesh, count: int | None, concavity: float) ->
     path = cache_directory() / "parts" / f"{key.hexdigest()[:32]}.npz"
     parts = _read_parts(path)
     if parts is None:
-        with _one_at_a_time(path.stem):
+        with one_at_a_time(cache_directory() / f".{path.stem}.lock"):
             parts = _read_parts(path)  # another process may have been faster
             if parts is None:
                 parts = _decompose(vertices, faces, count, concavity)
                 _write_parts(path, parts)
     return parts, key.hexdigest()
-
-
-@contextlib.contextmanager
-def _one_at_a_time(name: str) -> Iterator[None]:
-    """Wait for another process that decomposes the same mesh. Without a lock if none can be written."""
-    try:
-        import filelock
-    except ImportError as error:
-        raise MissingDependencyError("filelock") from error
-    path = cache_directory() / f".{name}.lock"
-    lock = filelock.FileLock(path)
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    try:
-        yield
-    finally:
-        if lock.is_locked:
-            with contextlib.suppress(OSError):
-                path.unlink()
-            lock.release()
 
 
 def _decompose(vertices: np.ndarray, faces: np.ndarray, count: int, concavity: float) -> tuple[np.ndarray, ...]:
