@@ -12,6 +12,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from difflcs_envs.errors import AssetError, MeshError, MissingDependencyError
 from difflcs_envs.locks import one_at_a_time
@@ -145,10 +146,11 @@ def _fetch(address: str, path: Path, wanted: str | None) -> Path:
     from requests import RequestException
 
     pooch.get_logger().setLevel("WARNING")
+    downloader: Any = pooch.HTTPDownloader(timeout=TIMEOUT)  # its type does not fit that of `fetch`
     hashes, urls = {path.name: wanted}, {path.name: address}
     site = pooch.create(path.parent, "", registry=hashes, urls=urls, retry_if_failed=ATTEMPTS - 1)
     try:
-        return Path(site.fetch(path.name, downloader=pooch.HTTPDownloader(timeout=TIMEOUT)))
+        return Path(site.fetch(path.name, downloader=downloader))
     except (OSError, ValueError, LookupError) as error:
         if isinstance(error, OSError) and not isinstance(error, RequestException):
             raise  # of the folder
