@@ -45,6 +45,8 @@ constexpr int64_t kStepsBeforeCertificate = 2;
 // A large weight of the augmented Lagrangian amplifies the rounding of a constraint. If more than this part of the
 // gradient is left at such a vertex, the multipliers are computed once more with the first weight.
 constexpr double kRoundingLeft = 1e-9;
+// Steps that each gain as much as the last one must not be enough for a start that is left early.
+constexpr double kHope = 100.0;
 
 template <class T>
 struct Progress {
@@ -280,12 +282,18 @@ struct Progress {
     return frozen;
   }
 
+  // Whether a lane that is explored gains too little to come below what its start needs.
+  bool hopeless(const MpcSolve& o, int l) const {
+    const double needed = o.start[lane[l].element].needed * lane_of(problem.cost_unit[0], l);
+    return lane[l].in_stage > 0 && lane[l].failures == 0 && J[l] - kHope * lane[l].gained > needed;
+  }
+
   // Leaves the lanes that have made their steps at the target to be compared, and gives them other problems.
   void leave(const MpcSolve& o, int64_t* counter, Mask frozen, int& live) {
     for (int l = 0; l < kLanes; l++) {
       if (frozen[l] || released[l] || needs_rollout[l] || eps[l] > batch.relaxation) continue;
       const int64_t steps = o.start[lane[l].element].explore;
-      if (steps == 0 || lane[l].in_stage < steps) continue;
+      if (steps == 0 || (lane[l].in_stage < steps && !hopeless(o, l))) continue;
       write(o, l, Status::max_iter, problem.multiplier, true);
       if (!take(o, counter, l)) live--;
     }

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 namespace difflcs {
 namespace {
@@ -24,17 +25,22 @@ struct Start {
 //
 // A start at the target, without a homotopy, needs more steps there before its objective can be compared. In a batch it
 // is then given up more often; for a single problem these steps are free while its first start is under way.
-constexpr int64_t kExplore = 2, kExploreFar = 6;
+constexpr int64_t kExplore = 2, kExploreFar = 6, kFixed = 4;
 Start start_of(int64_t i) {
   constexpr Start first[] = {{Actions::none, true, false, 1.0, kExplore},
                              {Actions::none, true, true, 1e-3, kExplore},
                              {Actions::forth, false, false, 0.0, kExploreFar},
                              {Actions::back, false, false, 0.0, kExploreFar}};
-  return i < 4 ? first[i] : Start{Actions::pulse, false, false, 0.0, kExploreFar};
+  return i < kFixed ? first[i] : Start{Actions::pulse, false, false, 0.0, kExploreFar};
 }
 
 // The first starts, which have no large actions.
 constexpr int64_t kNear = 2;
+// If of half of the starts, kHalf at least, kFound find the best plan and at most kLone end where no other does, to
+// kEqual of their cost, the search is over: what many find is rarely not the best. Starts after the first kFixed are
+// left where they seem not to come below the best cost by this part of it.
+constexpr int64_t kHalf = 8;
+constexpr double kEqual = 3e-4, kFound = 1.0 / 4.0, kLone = 1.0 / 8.0;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
 // A bound that is this many times farther than that plan counts as none.
 constexpr double kReach = 3.0, kNone = 100.0;
@@ -94,14 +100,24 @@ double uniform(uint64_t seed, int64_t start, int64_t position) {
 
 // Action `j` of stage `k` in a random pulse, in parts of the way from none to a bound: one way for at most the first
 // kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then
-// stopped so; actions that are random at every stage would cancel each other out.
-constexpr double kPush = 0.6, kBrake = 0.4, kLeastPulse = 0.5;
+// stopped so; actions that are random at every stage would cancel each other out. Two starts in a row go opposite ways
+// for as long, and the lengths of pairs are spread by the golden ratio, so that few starts have long ones and short
+// ones. From the second pair on every other one swings to and fro, kSwings to kMoreSwings times: so things bounce.
+constexpr double kPush = 0.6, kBrake = 0.4, kLeastPulse = 0.5, kGolden = 0.6180339887498949;
+constexpr double kSwings = 2.0, kMoreSwings = 8.0;
 double pulse(uint64_t seed, int64_t start, int64_t j, int64_t k, int64_t horizon) {
-  const auto random = [&](int64_t i) { return uniform(seed, start, 5 * j + i); };
-  const double push = kPush * random(0) * double(horizon), brake = push + kBrake * random(1) * double(horizon);
-  const double way = random(2) < 0.5 ? 1.0 : -1.0;
-  if (double(k) < push) return way * (kLeastPulse + (1.0 - kLeastPulse) * random(3));
-  return double(k) < brake ? -way * (kLeastPulse + (1.0 - kLeastPulse) * random(4)) : 0.0;
+  const auto random = [&](int64_t i) { return uniform(seed, start, 3 * j + i); };
+  const int64_t pair = start / 2;
+  const double spread = kGolden * double(pair) - std::floor(kGolden * double(pair)), h = double(horizon);
+  const double way = (j == 0 || uniform(seed, -1 - pair, j) < 0.5) == (start % 2 == 0) ? 1.0 : -1.0;
+  const double first = way * (kLeastPulse + (1.0 - kLeastPulse) * random(1));
+  if (pair > 1 && pair % 2 == 1) {
+    const double swings = kSwings + (kMoreSwings - kSwings) * spread;
+    return int64_t(swings * double(k) / h + random(0)) % 2 == 0 ? first : -first;
+  }
+  const double push = kPush * (1.0 - spread) * h, brake = push + kBrake * random(0) * h;
+  if (double(k) < push) return first;
+  return double(k) < brake ? -way * (kLeastPulse + (1.0 - kLeastPulse) * random(2)) : 0.0;
 }
 
 struct Sizes {
@@ -193,6 +209,24 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   return p;
 }
 
+// By which part of the cost of a plan others may lie behind where they are compared.
+double behind(const MpcBatch& b) { return comparison(b) > b.relaxation ? kBehind : 0.0; }
+
+// The objective below which a job must come that is to be better than a plan, by more than kEqual.
+double needed(const MpcBatch& b, double objective) { return objective + (behind(b) - kEqual) * std::abs(objective); }
+
+// Whether `count` starts, which reached these objectives, make others unnecessary.
+bool settled(const double* reached, int64_t count) {
+  const double best = *std::min_element(reached, reached + count);
+  const auto near = [](double a, double b) { return std::abs(a - b) <= kEqual * std::abs(b); };
+  int64_t found = 0, lone = 0;
+  for (int64_t i = 0; i < count; i++) {
+    found += near(reached[i], best);
+    lone += std::count_if(reached, reached + count, [&](double v) { return near(v, reached[i]); }) == 1;
+  }
+  return double(found) >= kFound * double(count) && double(lone) <= kLone * double(count);
+}
+
 }  // namespace
 
 void set_flags(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
@@ -215,6 +249,7 @@ void MpcSearch::Store::resize(const MpcBatch& batch, int64_t count) {
   fragile.resize(count);
   iterations.resize(count);
   element.resize(count);
+  owner.resize(count);
   start.resize(count);
 }
 
@@ -227,6 +262,7 @@ void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   const int64_t jobs = starts * batch.count;
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
+  reached.reserve(jobs);
   best.reserve(batch.count);
   live.reserve(batch.count);
   idle.reserve(batch.count);
@@ -284,6 +320,7 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
   tried.start[job].explore = s.explore;
+  tried.start[job].needed = kHuge;
   double* u = tried.u.data() + job * n.u;
   double largest = 1.0;
   for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
@@ -295,7 +332,8 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
     const int64_t k = i / b.n_u;
     if (s.actions == Actions::none || s.actions == Actions::pulse) {
       const double none = bound.clip(0.0);
-      const double part = s.actions == Actions::none ? 0.0 : pulse(effort.seed, start, i % b.n_u, k, b.horizon);
+      const bool pulsed = s.actions == Actions::pulse;
+      const double part = pulsed ? pulse(effort.seed, start - kFixed, i % b.n_u, k, b.horizon) : 0.0;
       u[i] = none + part * (part > 0 ? high - none : none - low);
     } else {
       u[i] = (s.actions == Actions::forth) == (2 * k < b.horizon) ? high : low;
@@ -353,42 +391,54 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
-  const int64_t starts = effort.starts;
+  const int64_t starts = effort.starts, half = std::max(kHalf, starts / 2), shift = guessed ? 1 : 0;
   const MpcPlans to = shifted(batch, out, first);
-  auto element = [&](int64_t e) { return batch.element ? batch.element[first + e] : first + e; };
 
-  // Job s * count + e is start s of element e.
-  tried.resize(batch, starts * count);
+  tried.resize(batch, 0);
+  reached.resize(count * starts);
   best.assign(count, -1);
-  std::fill(tried.status.begin(), tried.status.end(), kUnreached);
-  std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
-  for (int64_t j = 0; j < starts * count; j++) tried.element[j] = element(j % count);
-  for (int64_t begun = 0; begun < starts && !runner.stopped();) {
+  live.resize(count);
+  std::iota(live.begin(), live.end(), 0);
+  for (int64_t begun = 0; begun < starts && !live.empty() && !runner.stopped();) {
     const bool from_guess = guessed && begun == 0;
-    const int64_t shift = guessed ? 1 : 0;
     // Starts with large actions and no bounds wait for those that show how far to go.
-    const int64_t wide = begun == shift && batch.unbounded ? kNear : starts;
-    const int64_t end = from_guess ? 1 : std::min(starts, begun + wide);
-    for (int64_t j = begun * count; j < end * count; j++) {
-      const int64_t e = j % count;
+    const bool near = begun == shift && batch.unbounded;
+    const int64_t wide = near ? begun + kNear : begun < kFixed ? kFixed : begun < half ? half : starts;
+    const int64_t end = from_guess ? 1 : std::min(starts, wide);
+    // Job before + s * elements + i is start begun + s of the i-th element that is not done.
+    const int64_t before = tried.count(), elements = int64_t(live.size()), jobs = (end - begun) * elements;
+    tried.resize(batch, before + jobs);
+    for (int64_t j = before; j < before + jobs; j++) {
+      const int64_t e = live[(j - before) % elements];
+      tried.owner[j] = e;
+      tried.element[j] = batch.element ? batch.element[first + e] : first + e;
+      tried.status[j] = kUnreached;
+      tried.iterations[j] = 0;
       if (from_guess) {
         tried.start[j] = at_target(batch);
         tried.start[j].explore = kExplore;
+        tried.start[j].needed = kHuge;
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
-        continue;
+      } else {
+        begin(batch, effort, begun + (j - before) / elements - shift, j, best[e]);
       }
-      begin(batch, effort, j / count - shift, j, best[e]);
+      if (begun >= kFixed) tried.start[j].needed = needed(batch, tried.objective[best[e]]);
     }
-    explore(batch, effort, runner, begun * count, (end - begun) * count, from_guess && whole);
-    for (int64_t j = begun * count; j < end * count; j++) {
-      int64_t& b = best[j % count];
+    explore(batch, effort, runner, before, jobs, from_guess && whole);
+    for (int64_t j = before; j < before + jobs; j++) {
+      const int64_t e = tried.owner[j];
+      int64_t& b = best[e];
       if (tried.status[j] == kUnreached) continue;
+      reached[e * starts + begun + (j - before) / elements] = tried.objective[j];
       const bool sound = b >= 0 && tried.objective[b] < kHuge;  // it may be NaN after a breakdown
       if (!sound || tried.objective[j] < tried.objective[b]) b = j;
     }
     begun = end;
+    if (begun < half || runner.stopped()) continue;
+    const auto done = [&](int64_t e) { return settled(reached.data() + e * starts, begun); };
+    live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   }
 
   finish(batch, guess, effort, to, runner, first, count);
@@ -400,7 +450,7 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 template <class Wanted>
 int64_t MpcSearch::solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted) {
   const Sizes n(batch);
-  const int64_t all = int64_t(tried.element.size());
+  const int64_t all = tried.count();
   finished.resize(batch, all);
   origin.resize(all);
   int64_t kept = 0;
@@ -429,7 +479,7 @@ int64_t MpcSearch::solve_tried(const MpcBatch& batch, const MpcEffort& effort, R
 void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
-  const int64_t all = effort.starts * count;
+  const int64_t all = tried.count();
   std::fill_n(out.status, count, kUnreached);
   std::fill_n(out.iterations, count, 0);
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
@@ -442,18 +492,18 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     if (better || (alike && from.objective[i] < out.objective[e])) copy_plan(n, from, i, out, e);
   };
   const auto promises = [&](int64_t j) {
-    const int64_t b = best[j % count];
+    const int64_t b = best[tried.owner[j]];
     return j == b || promising(batch, j, tried.u.data() + b * n.u, tried.objective[b]);
   };
   const auto solve = [&](auto wanted) {
     const int64_t kept = solve_tried(batch, effort, runner, wanted);
-    for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
+    for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, tried.owner[origin[i]], false);
   };
   if (!runner.stopped()) solve(promises);
   // Some were solved before they were compared.
-  for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, j % count, true);
+  for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, tried.owner[j], true);
   if (!runner.stopped())
-    solve([&](int64_t j) { return !solved(out.status[j % count]) && !promises(j); });
+    solve([&](int64_t j) { return !solved(out.status[tried.owner[j]]) && !promises(j); });
   for (int64_t e = 0; e < count; e++) {
     if (out.status[e] != kUnreached) continue;
     if (best[e] >= 0) {  // out of time after its starts were compared
@@ -469,8 +519,7 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 
 // Whether a job may become better than a plan, and does not approach the same one.
 bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
-  const double behind = comparison(batch) > batch.relaxation ? kBehind * std::abs(objective) : 0.0;
-  if (!(tried.objective[job] - tried.gained[job] <= objective + behind)) return false;
+  if (!(tried.objective[job] - tried.gained[job] <= objective + behind(batch) * std::abs(objective))) return false;
   const Sizes n(batch);
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(batch, tried.element[job], i);
@@ -498,15 +547,14 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
   }
 }
 
-// Varies the plans of elements [first, first + count), and keeps what is better, until that gains nothing.
+// Varies the plans of those elements that `search` left, and keeps what is better, until that gains nothing.
 void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                         int64_t first, int64_t count) {
   const Sizes n(batch);
   const int64_t patience = kKinds / kVaried;
   idle.assign(count, 0);
-  live.clear();
-  for (int64_t e = 0; e < count; e++)
-    if (effort.starts >= kVaried && solved(out.status[e])) live.push_back(e);
+  const auto done = [&](int64_t e) { return effort.starts < kVaried || !solved(out.status[e]); };
+  live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < kMostRounds && !live.empty() && !runner.stopped(); round++) {
     // Job v * elements + i is variation v of the plan of the i-th element that is not done.
     const int64_t elements = int64_t(live.size()), all = kVaried * elements;
@@ -514,19 +562,20 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
     std::fill(tried.status.begin(), tried.status.end(), kUnreached);
     std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
     for (int64_t j = 0; j < all; j++) {
-      const int64_t e = live[j % elements];
+      const int64_t e = tried.owner[j] = live[j % elements];
       tried.element[j] = batch.element ? batch.element[first + e] : first + e;
       tried.start[j] = {false, false, 0.0, comparison(batch)};
       tried.start[j].explore = kExploreFar;
+      tried.start[j].needed = needed(batch, out.objective[e]);
       vary(batch, effort, kVaried * round + j / elements, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {
-      const int64_t e = live[j % elements];
+      const int64_t e = tried.owner[j];
       return promising(batch, j, out.u + e * n.u, out.objective[e]);
     });
     for (int64_t i = 0; i < kept; i++) {
-      const int64_t e = live[origin[i] % elements];
+      const int64_t e = tried.owner[origin[i]];
       out.iterations[e] += finished.iterations[i];
       if (!solved(finished.status[i]) || !(finished.objective[i] < out.objective[e])) continue;
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) idle[e] = -1;

@@ -62,10 +62,11 @@ class MpcSearch {
     std::vector<double> x, u, lam, mu, objective, residual, gained;
     std::vector<int8_t> status, fragile;
     std::vector<int32_t> iterations;
-    std::vector<int64_t> element;
+    std::vector<int64_t> element, owner;  // in the batch, and in the part of it that is being searched
     std::vector<MpcStart> start;
     void resize(const MpcBatch& batch, int64_t count);
     MpcPlans plans();
+    int64_t count() const { return int64_t(element.size()); }
   };
 
   void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const;
@@ -89,6 +90,7 @@ class MpcSearch {
 
   const Kernels& kernels;
   Store tried, finished;
+  std::vector<double> reached;  // objectives of the starts of each element
   std::vector<int64_t> best;    // of the jobs tried for each element
   std::vector<int64_t> live, idle;  // elements that are still searched, and for how many rounds without gain
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from

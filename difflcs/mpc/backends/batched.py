@@ -20,7 +20,8 @@ Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with
 # four starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
-_MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON, _MORE_STARTS = 100, 30, 40, 4
+# Where these are easy, their starts agree, and half of them are enough (search.cpp).
+_MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON, _MORE_STARTS = 100, 20, 40, 4
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,12 @@ class BatchedBackend(Backend):
 
     The problem has local optima. `effort` says how many starts are tried: the feedback law of the plant without
     contact, along a long homotopy and a short one; the largest actions forth and then back, and back and then forth,
-    which find contacts that are far; random pulses, a push and a brake of each action. Starts are compared after a few
-    steps at the relaxation, and only those that may still win are solved to the end. The starts of an element lie side
-    by side in the lanes of a vector, so that one problem with four starts takes less than twice as long as with one; a
-    batch pays for each. From eight starts on a local search follows: the best plan is varied, above all a stage or more
-    earlier or later, until that finds nothing better.
+    which find contacts that are far; random pulses, a push and a brake of each action, or swings to and fro. Starts are
+    compared after a few steps at the relaxation, and only those that may still win are solved to the end. The starts of
+    an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
+    long as with one; a batch pays for each. Of sixteen or more, half are enough where most of them agree. From eight
+    starts on a local search follows, unless they agree: the best plan is varied, above all a stage or more earlier or
+    later, until that finds nothing better.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
@@ -61,7 +63,7 @@ class BatchedBackend(Backend):
 
     Attributes:
         effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
-            n_lam is 100 or more, or 30 times n_u, or the horizon 40, as such plans have many optima. A guess is the
+            n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the
             first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From eight on with a local search.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
