@@ -1,17 +1,12 @@
 """Every notebook in `tutorials/` runs, is committed with its outputs, and keeps the form that readers know."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pytest
 
 from tests.system.forks import run_code
-
-if TYPE_CHECKING:
-    import nbformat
 
 FOLDER = Path(__file__).parents[2] / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -23,7 +18,7 @@ INSTALL = re.compile(
     r"# From a checkout .*\ntry:\n    import difflcs  # noqa: F401\nexcept ImportError:\n"
     r'    %pip install --quiet "\.\.\[([a-z,]+)\]"$'
 )
-# Where Jupyter runs the cells, without its sockets; figures are drawn after each cell.
+# A kernel of Jupyter runs cells in such a shell; here it has no sockets. Figures are drawn after each cell.
 SHELL = """
 os.environ["SMOKE"] = "1"
 from IPython.core.interactiveshell import InteractiveShell
@@ -34,17 +29,17 @@ shell.enable_matplotlib("inline")
 """
 
 
-def read(path: Path) -> nbformat.NotebookNode:
+def read(path: Path) -> Any:
     import nbformat  # takes seconds; collecting the tests does without
 
     return nbformat.read(path, as_version=4)
 
 
-def code(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+def code(notebook: Any) -> list[Any]:
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def said(notebook: nbformat.NotebookNode) -> str:
+def said(notebook: Any) -> str:
     """All text of the outputs."""
     parts = []
     for cell in code(notebook):
