@@ -45,8 +45,9 @@ class Solver(TorchRival):
         controller = self.controllers[0]
         controller.reset()
         controller.step(self.problem.x0[i])
-        assert controller.plan is not None
-        return Answer(controller.plan.u[None], np.array([controller.plan.status.solved]))
+        plan = controller.plan
+        assert plan is not None
+        return Answer(plan.u[None], np.array([plan.status.solved]))
 
     def step(self, i: int, x: np.ndarray) -> np.ndarray:
         """Return the action of a warm controller."""

@@ -44,7 +44,7 @@ class Linearisation {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
     arena.take(M, count, nl, nl);
     arena.take(K_lam, n.h, nl, nw);
-    arena.take(A_hat, count, nx, nw);
+    arena.take(A_hat, nl > 0 || problem.AB.count > 1 ? count : 1, nx, nw);  // without contacts it is [A B]
     arena.take(K_s, kept ? count : 0, nl, nw);
     arena.take(size, count, nl);
     arena.take(y, count, nl);

@@ -172,6 +172,15 @@ DIFFLCS_INLINE void multiply_columns(const M& matrix, const W& vector, const Vec
   });
 }
 
+// The same of a symmetric matrix, whose rows are its columns.
+template <class M, class W>
+DIFFLCS_INLINE void multiply_symmetric(const M& matrix, const W& vector, const Vec* first, Vec* to) {
+  if constexpr (kLanes == 1)
+    multiply_columns(matrix, vector, first, to);
+  else
+    multiply(matrix, vector, [&](int64_t i) { return first[i]; }, [&](int64_t i, Vec sum) { to[i] = sum; });
+}
+
 // Calls store(i, j, first(i, j, V{}) + x.column(i) * y.column(j)) for the rows [from, to) and the columns
 // [begin, end(i)), as many at a time as V holds. `end` does not fall with i. Of one problem alone four rows are summed
 // side by side, so that no sum waits for itself.

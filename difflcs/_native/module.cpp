@@ -40,9 +40,14 @@ struct AlignedDelete {
   void operator()(void* p) const { ::operator delete(p, std::align_val_t{64}); }
 };
 
+// The first number is zero: a workspace that has kept nothing yet (MpcBatch::version).
 struct AlignedBuffer {
+  int64_t bytes = 0;
   std::unique_ptr<void, AlignedDelete> data;
-  explicit AlignedBuffer(int64_t bytes) : data(::operator new(bytes, std::align_val_t{64})) {}
+  AlignedBuffer() = default;
+  explicit AlignedBuffer(int64_t bytes) : bytes(bytes), data(::operator new(bytes, std::align_val_t{64})) {
+    *static_cast<int64_t*>(data.get()) = 0;
+  }
 };
 
 // Flag by which one thread ends the work of all threads of a call.
@@ -81,16 +86,15 @@ struct Lookout {
   }
 };
 
-// Runs work(workspace, watch) on at most `threads` threads, GIL released. If a thread cannot be started, or has no
-// memory, the others do its work. Raises the exception of a signal handler.
+// Runs work(workspace, watch) on at most `threads` threads, GIL released, on this one in the memory of `mine`. If a
+// thread cannot be started, or has no memory, the others do its work. Raises the exception of a signal handler.
 template <class Work>
-void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work) {
+void on_threads(int64_t threads, const AlignedBuffer& mine, Stop& stop, Work work) {
   {
     nb::gil_scoped_release release;
-    const AlignedBuffer workspace(workspace_bytes);
     std::vector<std::thread> pool;
     auto start = [&] {
-      auto workspace = std::make_shared<AlignedBuffer>(workspace_bytes);
+      auto workspace = std::make_shared<AlignedBuffer>(mine.bytes);
       pool.emplace_back([&work, &stop, workspace] {
         Lookout lookout{stop, false};
         work(workspace->data.get(), difflcs::Watch{&Lookout::ask, &lookout});
@@ -103,7 +107,7 @@ void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work)
     } catch (const std::bad_alloc&) {
     }
     Lookout lookout{stop, true};
-    work(workspace.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+    work(mine.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
     for (auto& t : pool) t.join();
   }
   if (stop.ending == kInterrupted) throw nb::python_error();
@@ -116,7 +120,7 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& sto
   std::atomic<int64_t> next{0};
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
   std::fill_n(batch.status, count, difflcs::kUnreached);
-  on_threads(used, kernels.lcp_workspace(batch.n), stop, [&](void* workspace, difflcs::Watch watch) {
+  on_threads(used, AlignedBuffer(kernels.lcp_workspace(batch.n)), stop, [&](void* workspace, difflcs::Watch watch) {
     for (int64_t b; (b = next.fetch_add(block)) < count && !watch.stop(watch.context);)
       kernels.lcp_solve(batch, b, std::min(b + block, count), workspace, watch);
   });
@@ -195,6 +199,34 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   return b;
 }
 
+// Workspace of a thread that Python calls from, with the problem that it was last used for: what it has prepared of the
+// matrices is good for other calls with the same, as in the loop of a robot.
+struct Kept {
+  AlignedBuffer workspace;
+  std::vector<double> problem;  // sizes and matrices
+  int64_t version = 0;
+};
+thread_local Kept kept;
+constexpr int64_t kMostKept = 1 << 22;  // bytes of the workspace
+
+// The number that `kept` has for a problem, see MpcBatch::version.
+int64_t version_of(const difflcs::MpcBatch& b) {
+  std::vector<double> problem{double(b.n_x), double(b.n_u), double(b.n_lam), double(b.n_c), double(b.horizon), b.barrier};
+  for (int i = 0; i < difflcs::kInputs; i++) {
+    const difflcs::Field& field = difflcs::kMpcFields[i];
+    problem.push_back(double(b.step[i]));
+    if (field.columns == difflcs::Size::one) continue;
+    if (b.stride[i]) return 0;
+    const int64_t count = difflcs::extent(b, field) * (b.step[i] ? difflcs::stages_of(b, field) : 1);
+    problem.insert(problem.end(), b.input[i], b.input[i] + count);
+  }
+  const size_t size = problem.size();
+  if (size == kept.problem.size() && !std::memcmp(problem.data(), kept.problem.data(), size * sizeof(double)))
+    return kept.version;
+  kept.problem.swap(problem);
+  return ++kept.version;
+}
+
 // The threads of one call.
 struct Threads final : difflcs::Runner {
   const int64_t most;
@@ -203,8 +235,12 @@ struct Threads final : difflcs::Runner {
   void run(int64_t problems, int64_t workspace_bytes, bool to_the_end, Work work, void* context) override {
     Stop never;
     const int64_t used = std::max<int64_t>(1, std::min<int64_t>(most, problems / difflcs::kernels().lanes));
-    on_threads(used, workspace_bytes, to_the_end ? never : stop,
+    AlignedBuffer mine;  // not in `kept` meanwhile: a signal handler may call, too
+    if (workspace_bytes <= kMostKept) std::swap(mine, kept.workspace);
+    if (mine.bytes < workspace_bytes) mine = AlignedBuffer(workspace_bytes);
+    on_threads(used, mine, to_the_end ? never : stop,
                [&](void* workspace, difflcs::Watch watch) { work(context, workspace, watch); });
+    if (mine.bytes <= kMostKept) std::swap(mine, kept.workspace);
   }
   bool stopped() const override { return stop.ending != kGoOn; }
 };
@@ -216,7 +252,8 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
                int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> mu,
                Output<double> objective, Output<double> residual, Output<int8_t> status, Output<int8_t> fragile,
                Output<int32_t> iterations) {
-  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
+  difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
+  b.version = version_of(b);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
   check_size("x", x.size(), states);
@@ -293,7 +330,7 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
   std::atomic<int64_t> next{0};
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, blocks));
   Stop stop;
-  on_threads(used, kernels.mpc_workspace(b), stop, [&](void* workspace, Watch watch) {
+  on_threads(used, AlignedBuffer(kernels.mpc_workspace(b)), stop, [&](void* workspace, Watch watch) {
     for (int64_t i; (i = next.fetch_add(1)) < blocks;)
       kernels.mpc_vjp(b, o, i * block, std::min(b.count, (i + 1) * block), i, workspace, watch);
   });
@@ -343,7 +380,8 @@ difflcs::ViolationBatch violation_batch(const Inputs& inputs, double xi, Output<
 template <class Work>
 void pass(difflcs::ViolationBatch& b, Work work) {
   Stop stop;
-  on_threads(1, difflcs::kernels().violation_workspace(b), stop, [&](void* workspace, difflcs::Watch watch) {
+  const AlignedBuffer workspace(difflcs::kernels().violation_workspace(b));
+  on_threads(1, workspace, stop, [&](void* workspace, difflcs::Watch watch) {
     b.watch = watch;
     work(workspace);
   });

@@ -51,6 +51,7 @@ template <class T, class S>
 struct StageData {
   static constexpr int64_t kX = S::kX, kU = S::kU, kL = S::kL, kW = S::kW;
   Matrix<T, kX, kW> AB;
+  Matrix<T, kW, kX> AB_t;  // transposed, of one problem alone
   Matrix<T, kX, kL> C;
   Matrix<T, kL, kW> DE;
   Matrix<T, kL, kL> F;
@@ -77,8 +78,13 @@ struct StageData {
   void next_state(const Vec* x, const Vec* u, const Vec* lam, Vec* out) const {
     const auto store = [&](int64_t i, Vec sum) { out[i] = sum; };
     const auto so_far = [&](int64_t i) { return out[i]; };
-    multiply(A(), x, [&](int64_t i) { return d[i]; }, store);
-    multiply(B(), u, so_far, store);
+    if constexpr (kLanes == 1) {
+      multiply_columns(Matrix<T, kX, kX>{AB_t[0], {Q.rows}, {Q.rows}, {Q.rows}}, x, d, out);
+      multiply_columns(Matrix<T, kU, kX>{AB_t[Q.rows], {R.rows}, {Q.rows}, {Q.rows}}, u, out, out);
+    } else {
+      multiply(A(), x, [&](int64_t i) { return d[i]; }, store);
+      multiply(B(), u, so_far, store);
+    }
     multiply(C, lam, so_far, store);
   }
 
@@ -123,7 +129,7 @@ struct ProblemData {
   const bool caller_units;                               // of the cost: the adjoint differentiates it as it is
   const bool shared;                                     // the matrices are loaded once, for all problems
   bool kept = false;                                     // the memory has them already
-  Stages<Matrix<T, 0, 0>> AB, C, DE, F, Q, R, cross, G;  // [A B], [D E], S, [G_x G_u]
+  Stages<Matrix<T, 0, 0>> AB, AB_t, C, DE, F, Q, R, cross, G;  // [A B], [D E], S, [G_x G_u]
   Matrix<T, 0, 0> Q_final;
   // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
   // [D E], F, c, lam and s are kept in these units; the product lam o s does not change.
@@ -138,6 +144,7 @@ struct ProblemData {
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
+  Vec* product;  // of a matrix and a state
   Vec* reach;  // of each constraint: the least unit of its violation, a part of its largest change in a step
   Vec mu;      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
@@ -155,6 +162,7 @@ struct ProblemData {
     const int64_t bounds = by_stage(ku_min, ku_max) ? h : 1;
     const int64_t rows = nc && by_stage(kG_x, kG_u, kg, kprice) ? h + 1 : 1;
     arena.take(AB, systems, nx, nw);
+    arena.take(AB_t, kLanes == 1 ? systems : 0, nw, nx);
     arena.take(C, systems, nx, nl);
     arena.take(DE, systems, nl, nw);
     arena.take(F, systems, nl, nl);
@@ -178,6 +186,7 @@ struct ProblemData {
     arena.take(u_max, bounds, nu);
     arena.take(per_width, bounds, nu);
     arena.take_all(nx, q_final, x0);
+    arena.take(product, nw);
     arena.take(multiplier, h + 1, nc);
     arena.take(reach, nc);
     if (!arena.memory) return;
@@ -189,8 +198,9 @@ struct ProblemData {
 
   template <class S = AnySizes>
   StageData<T, S> stage(int64_t k) const {
-    return {AB[k],   C[k], DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k], row_scale[k],
-            rest[k], d[k], c[k],  q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],     price[k]};
+    return {AB[k],        AB_t[k], C[k], DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k],
+            row_scale[k], rest[k], d[k], c[k],  q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],
+            price[k]};
   }
   // Only the constraints mean something there.
   template <class S = AnySizes>
@@ -236,6 +246,8 @@ struct ProblemData {
       const StageData<T, AnySizes> to = stage(k);
       matrix(to.A(), kA, k, one, one);
       matrix(to.B(), kB, k, one, one);
+      for (int64_t i = 0; i < nw && kLanes == 1; i++)
+        for (int64_t j = 0; j < n.x(); j++) to.AB_t(i, j) = to.AB(j, i);
       matrix(to.C, kC, k, one, contact);
       matrix(to.D(), kD, k, contact, one);
       matrix(to.E(), kE, k, contact, one);
@@ -419,10 +431,11 @@ struct ProblemData {
  private:
   template <class S>
   Vec plain_cost(const Trajectory<S>& at) const {
-    auto quadratic = [](const auto& W, const Vec* linear, const Vec* z) {
+    auto quadratic = [this](const auto& W, const Vec* linear, const Vec* z) {
       Vec total = all(0);
-      const auto add = [&](int64_t i, Vec sum) { total += z[i] * (0.5 * sum + linear[i]); };
-      multiply(W, z, [](int64_t) { return all(0); }, add);
+      for (int64_t i = 0; i < W.rows; i++) product[i] = all(0);
+      multiply_symmetric(W, z, product, product);
+      for (int64_t i = 0; i < W.rows; i++) total += z[i] * (0.5 * product[i] + linear[i]);
       return total;
     };
     Vec total = quadratic(Matrix<T, S::kX, S::kX>(Q_final), q_final, at.x[n.h]);

@@ -161,7 +161,7 @@ class Riccati {
         linear_value(k);
       else
         feedback_law(k);
-      if (keeps) keep(k, sound);
+      if (keeps) keep(k, data, sound);
     }
     for (int64_t i = 0; i < n.c(); i++)
       result.violated = max(result.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
@@ -347,11 +347,16 @@ class Riccati {
   void states(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Value<S>& next, const Vec* x,
               const Vec* u, const Vec* x_bar, const Vec* lam_bar) {
     Vec* p = value(k).p;
-    multiply(data.Q, x, [&](int64_t i) { return data.q[i]; }, [&](int64_t i, Vec t) { p[i] = t; });
+    multiply_symmetric(data.Q, x, data.q, p);
     for (int64_t i = 0; i < n.x() && (problem.batch.crossed || n.c() > 0); i++) {
       if (problem.batch.crossed) p[i] = p[i] + data.cross.row(i) * u;
       if (n.c() > 0) result.cost_gradient += abs(p[i]);
       for (int64_t r = 0; r < n.c(); r++) p[i] += data.G(r, i) * force(k, r);
+    }
+    if constexpr (kLanes == 1 && !kAdjoint) {
+      const auto A = stage.A_hat.block(0, Dim<kX>{n.x()});
+      multiply_columns(A, next.v, p, linear);
+      return multiply_columns(A, next.p, p, p);
     }
     by_columns(0, n.x(), [&](int64_t i, auto kind) {
       using V = decltype(kind);
@@ -370,11 +375,11 @@ class Riccati {
     return !any(differs);
   }
 
-  void keep(int64_t k, bool sound) {
+  void keep(int64_t k, const StageData<T, S>& data, bool sound) {
     known[k] = sound;
     for (int64_t j = 0; j < n.u(); j++) {
       held(k, j) = active[j];
-      known[k] = known[k] && !any(flat[j] > 0);
+      known[k] = known[k] && !any(~(data.R(j, j) > kPriced * abs(H(n.x() + j, n.x() + j))));
     }
   }
 

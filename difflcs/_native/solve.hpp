@@ -57,12 +57,13 @@ class Solver {
 
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
   void contacts(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
+    if (n.l() == 0) return;
     data.gap(x, u, progress.gap);
     Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot, &problem.low_rank[k])
         .solve(lam, s, progress.eps, skip);
   }
 
-  // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
+  // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane, unless the next step needs none.
   Vec rollout(Mask wanted, Watch watch) {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
@@ -70,7 +71,7 @@ class Solver {
       contacts(k, data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | progress.released);
       data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
-    return problem.cost(at);
+    return problem.linear() && !any(wanted & ~progress.released) ? all(0) : problem.cost(at);
   }
 
   // The trial trajectory with step length `step` along the feedback law; lanes in `frozen` stay where they are, those

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,8 @@ from difflcs.mpc.setup import GUESS, RANKS, SYMMETRIC, Call, Inputs, Setup, chec
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
+_AFTERWARDS = 1e-4  # seconds of a call that its solver must leave for what comes after it
+
 
 def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]:
     """Solve a call; return its solver, and the outputs of `MPCSolver.solve` as nodes of the graph.
@@ -35,6 +38,7 @@ def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]
     needs_grad = torch.is_grad_enabled() and (transformed or any([tensor.requires_grad for tensor in tensors.values()]))
     solver = MPCSolver(
         setup.backend,
+        setup.began,
         setup.relaxation,
         setup.barrier,
         names=(*tensors, *guess),
@@ -53,7 +57,7 @@ class MPCSolver(Solver):
     """Solver of an `MPCProblem`: its inputs and parts of a guess, with any batch dimensions → a plan.
 
     Attributes:
-        backend, relaxation, barrier: see `MPCProblem` and `Backend`.
+        backend, began, relaxation, barrier: see `Setup`.
         names: of the tensors that are passed.
         inputs: horizon, sizes and which inputs are by stage, without the tensors.
         batch: batch dimensions that all inputs broadcast to.
@@ -65,6 +69,7 @@ class MPCSolver(Solver):
     """
 
     backend: Backend
+    began: float
     relaxation: float
     barrier: float
     names: tuple[str, ...]
@@ -124,7 +129,11 @@ class MPCSolver(Solver):
         """Solve the problem as it is and return the outputs of `solve` on a device."""
         problem, constant = self.problem, self.constant
         violation = torch.from_numpy(np.zeros(problem.batch))  # before the solve, and by NumPy, as it is faster
-        result = self.backend.solve(problem, start)
+        backend, limit = self.backend, getattr(self.backend, "time_limit", None)
+        if limit is not None:
+            left = limit - (time.perf_counter() - self.began) - _AFTERWARDS
+            backend = replace(backend, time_limit=max(left, 1e-9))  # pyright: ignore
+        result = backend.solve(problem, start)
         if problem.n_c:
             violation = problem.violation(result.primal.x, result.primal.u)
             # The numbers of a failed element can be so large that their products overflow.

@@ -150,6 +150,8 @@ class MPCController:
         self._native = _kernels.Controller(self._content)
         self._native.set_fallback(self._fallback, self._action)
         self._native.set_time_limit(self._time_limit or 0.0)
+        sizes, H = self._native.sizes(), self.horizon
+        self._shapes = (H + 1, self.n_x), (H, self.n_u), (H, sizes["n_lam"]), (H + 1, sizes["n_c"])
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy begins anew, without the last plan."""
@@ -330,9 +332,7 @@ class MPCController:
         """Copy of the solver's last result, even if that step was not solved. None before the first step."""
         if self._status is None:
             return None
-        sizes, H = self._native.sizes(), self.horizon
-        shapes = (H + 1, self.n_x), (H, self.n_u), (H, sizes["n_lam"]), (H + 1, sizes["n_c"])
-        x, u, lam, mu = (np.empty(shape) for shape in shapes)
+        x, u, lam, mu = map(np.empty, self._shapes)
         self._native.plan(x, u, lam, mu)
         status, fallback, late, iterations, objective, residual, seconds = self._native.outcome()
         return ControllerPlan(x, u, lam, mu, objective, Status(status), fallback, late, iterations, residual, seconds)

@@ -1,6 +1,7 @@
 """PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
 import sys
+import time
 import warnings
 
 import torch
@@ -135,6 +136,7 @@ class LCSMPCLayer(nn.Module):
             self.relaxation,
             self.barrier,
             self.backend,
+            time.perf_counter(),
             self.u_min,
             self.u_max,
             self.bounds,

@@ -48,6 +48,7 @@ class Repeat:
         if last is not None and signature is not None and last.fits(setup, call, signature):
             start = last.start(call)
             solver = last.solver(setup, call)
+            solver.began = setup.began
             return solver, solver.run(start, call.x0.device)
         solver, outputs = solve_call(setup, call)
         if signature is not None and not solver.needs_grad and setup.limits is None:

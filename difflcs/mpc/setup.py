@@ -50,6 +50,7 @@ class Setup(NamedTuple):
     """Settings of a layer as they are now; the names are those of `LCSMPCLayer`.
 
     Attributes:
+        began: when the layer was called, by `time.perf_counter`: a time limit of its backend counts from then.
         limits: a subclass's function from a system to the bounds of the actions; None: u_min and u_max within the
             action support of the system.
     """
@@ -60,6 +61,7 @@ class Setup(NamedTuple):
     relaxation: float
     barrier: float
     backend: Backend
+    began: float
     u_min: Tensor
     u_max: Tensor
     bounds: StageBounds | None

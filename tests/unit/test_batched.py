@@ -4,6 +4,8 @@ import inspect
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -35,6 +37,16 @@ def costs(mpc, *call, **options):
     mpc.backend = BatchedBackend(**options)
     with torch.no_grad():
         return mpc(*call).objective
+
+
+@pytest.mark.parametrize("n_lam", [0, 3])
+def test_what_a_thread_keeps_of_a_problem_serves_no_other(build, n_lam):
+    mpc = LCSMPCLayer(build.params(0, n_lam=n_lam), build.cost(0), 6, -0.3, 0.3)
+    first, solve = mpc(build.normal(1)(1, mpc.lcs.n_x)).problem, BatchedBackend().solve
+    for change in ({}, {"A": 1.01 * first.A}, {"Q": 2 * first.Q}, {"barrier": 0.1}, {"horizon": 4}, {}):
+        problem = replace(first, **change)
+        with ThreadPoolExecutor(1) as new:
+            assert torch.equal(solve(problem, None).primal.u, new.submit(solve, problem, None).result().primal.u)
 
 
 def test_threads_change_nothing_not_even_summed_gradients(build):

@@ -70,9 +70,9 @@ class BatchedBackend(Backend):
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
             homotopy; and with row exchanges in the elimination of λ if it failed for lack of them.
-        time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
-            keep their best iterate, executed at the relaxation; those not begun stay at the actions of the guess or
-            zero, with x = x0 and λ = 0.
+        time_limit: seconds for one call, of a layer from its beginning to its end; None for no limit. Elements not
+            solved by then are MAX_ITER: those under way keep their best iterate, executed at the relaxation; those not
+            begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
         seed: seed of the random starts, which are the same for every element.
         homotopy: λ·s at which a cold start begins, as a multiple of the relaxation; None: the square of the mean gap
             of the contacts, in the units in which F has a unit diagonal. A guess starts at the relaxation.
@@ -156,7 +156,7 @@ class BatchedBackend(Backend):
         )
         seconds.fill((time.perf_counter() - started) / max(batch, 1))
         if not result.all_converged:
-            if not all(np.isfinite(outputs[name]).all() for name in ("x", "u", "lam", "mu")):
+            if not _kernels.all_finite([outputs[name] for name in ("x", "u", "lam", "mu")]):
                 self._make_finite(problem, result.primal, result.status)
             if problem.n_c:
                 self._confirm_infeasible(problem, result.primal, result.status, started)
