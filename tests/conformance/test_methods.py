@@ -30,14 +30,16 @@ pytestmark = pytest.mark.usefixtures("registered")
 
 # The toy is no MuJoCo model; this method is contact-lcs besides, see tests/unit/test_contact_method.py.
 NAMES = tuple(name for name in method_names() if name != MujocoMethod.name)
-TOY, LARGER = make_task(), make_task(size=3)
-PLANE, LARGER_PLANE = (make_task(size=size, inputs=2, planar=True) for size in (5, 7))
+TOY = make_task()
 
 
 def task_of(name: str, larger: bool = False) -> TaskSpec:
     """The toy as a method takes it: with a body and a point on a plane where it learns in the frame of the body."""
-    tasks = (PLANE, LARGER_PLANE) if name == FrameMethod.name else (TOY, LARGER)
-    return tasks[larger]
+    return (
+        make_task(size=5 + 2 * larger, inputs=2, planar=True)
+        if name == FrameMethod.name
+        else make_task(size=2 + larger)
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)

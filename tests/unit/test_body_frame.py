@@ -1,7 +1,6 @@
 """An LCS in the frame of a body: its matrices, its Jacobian, its files, and the method that learns it."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -47,9 +46,22 @@ def test_its_jacobian_is_that_of_any_module(lcs, build):
     torch.testing.assert_close(found, system_jacobian(mpc, state, goal, None, None))
 
 
+def test_units_change_the_parameters_and_not_the_system(lcs, build):
+    x, u = build.normal(0)(20, 7), build.normal(1)(20, 4)
+    after = x + 0.01 * build.normal(2)(20, 7)
+    lcs.take_units(x, u, x + after)
+    system, D = lcs.params(x), lcs.D.clone()
+    seen, v, seen_after = lcs.take_units(2 * x, u, after)
+    assert not torch.allclose(lcs.D, D)
+    torch.testing.assert_close(lcs.params(x).step(x, u).x_next, system.step(x, u).x_next)
+    torch.testing.assert_close((seen_after - seen).std(0, correction=0), torch.ones_like(x[0]))
+    torch.testing.assert_close(lcs.at_rest().gap(seen, v), lcs.params(2 * x).gap(2 * x, u))
+
+
 def test_files_and_sizes(lcs, tmp_path, build):
+    x = build.normal(0)(9, 7)
+    lcs.take_units(x, build.normal(1)(9, 4), 2 * x)
     lcs.save_pretrained(tmp_path)
-    x = build.normal(0)(7)
     torch.testing.assert_close(BodyFrameLCS.from_pretrained(tmp_path).params(x).A, lcs.params(x).A, rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="BodyFrameLCS"):
         LCSModel.from_pretrained(tmp_path)
@@ -61,12 +73,11 @@ def test_files_and_sizes(lcs, tmp_path, build):
 
 
 @pytest.mark.slow
-def test_it_is_trained_with_and_without_ppo(tmp_path):
-    for minutes, phases in ((0.2, 1), (0.6, 2)):
-        config = TrainConfig(task="cube", method=FrameMethod().smoke(), minutes=minutes, final_goals=3)
-        run = train(config, tmp_path / str(phases))
-        assert any(row["kl"] for row in run.rows()) == (phases == 2)
-        policy: Any = load_policy(run)
-        assert isinstance(policy.lcs, BodyFrameLCS)
+def test_the_warmup_alone_will_do(tmp_path):
+    """With PPO after it: tests/conformance/test_methods.py."""
+    config = TrainConfig(task="cube", method=FrameMethod().smoke(), minutes=0.2, final_goals=3)
+    run = train(config, tmp_path / "run")
+    assert not any(row["kl"] for row in run.rows())
+    assert isinstance(load_policy(run).lcs, BodyFrameLCS)
     with pytest.raises(InvalidInputError, match="a planar task for frame-lcs, got turn_cube"):
         train(replace(config, task="turn_cube"), tmp_path / "other")

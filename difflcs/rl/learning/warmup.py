@@ -12,6 +12,7 @@ from torch import Tensor
 
 from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
+from difflcs.physics.frame import BodyFrameLCS
 from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state import State
@@ -107,7 +108,7 @@ def fit(
     *,
     context: Tensor | None = None,
 ) -> Fit:
-    """Fit a model to transitions by the violation loss, with a fresh Adam.
+    """Fit a model to transitions by the violation loss, with a fresh Adam; a `BodyFrameLCS` in units of the data.
 
     Args:
         lcs: an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; changed in place.
@@ -126,7 +127,9 @@ def fit(
         GammaError: gamma of the loss is too large for this model.
         InvalidInputError: the module has no learnable parameter, or its system does not depend on one.
     """
-    module = check_module(lcs)
+    module, body = check_module(lcs), lcs if isinstance(lcs, BodyFrameLCS) else None
+    if body is not None:
+        (x, u, x_next), context = body.take_units(x, u, x_next), None
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
     n_train = max(1, int((1 - HELD_OUT) * len(x)))
@@ -142,7 +145,8 @@ def fit(
         parts = [v[shuffled].split(size) for v in (x, u, x_next)]
         context_batches = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
         for x_batch, u_batch, next_batch, context_batch in zip(*parts, context_batches, strict=True):
-            loss = violation_loss(lcs, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
+            system = lcs if body is None else body.at_rest()
+            loss = violation_loss(system, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
             check_depends(loss)
             adam.zero_grad()
             loss.backward()
@@ -153,7 +157,8 @@ def fit(
     with torch.no_grad():
         held_out = (x[rest], u[rest], x_next[rest], gamma, xi)
         rest_context = None if context is None else context[rest]
-        left_out = violation_loss(lcs, *held_out, context=rest_context) if len(rest) else None
+        system = lcs if body is None else body.at_rest()
+        left_out = violation_loss(system, *held_out, context=rest_context) if len(rest) else None
     return Fit(float(torch.stack(recent).mean()), None if left_out is None else float(left_out), steps)
 
 

@@ -10,11 +10,15 @@ from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods.base import Work
 from difflcs.rl.methods.lcs_rl import LCSRLMethod
 from difflcs.rl.methods.phases import warmup_phase
+from difflcs.rl.settings import bounded
 
 
 @dataclass(frozen=True)
 class FrameMethod(LCSRLMethod):
     """LCS-RL with a `BodyFrameLCS`: the warm-up, and then PPO if there is data left. For tasks that are `planar`."""
+
+    init_scale: float = bounded(0.3, minimum=0)
+    """Initial parameters are uniform within ± this, in units of the first data."""
 
     name: ClassVar[str] = "frame-lcs"
     version: ClassVar[int] = 1
