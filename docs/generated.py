@@ -165,7 +165,7 @@ def methods() -> str:
             f'## {name}\n\n{kind.summary[0].upper()}{kind.summary[1:]}. {only}In Python: `get_method("{name}")`.'
         )
         own = {row[0]: row for row in rows if "." not in row[0]}
-        if own and all(flag in shown for flag in own):
+        if own and all(flag in shown and shown[flag][1][flag] == row for flag, row in own.items()):
             parts.append(
                 f"{', '.join(f'`{flag}`' for flag in own)}: as with [{shown[min(own)][0]}](#{shown[min(own)][0]})."
             )
