@@ -27,32 +27,39 @@ def sources(folder):
     return sorted((ROOT / folder).rglob("*.py"))
 
 
+CALLS = """
+m = difflcs.LCSModel(2, 1, 1)
+x, u = torch.zeros(3, 2).double(), torch.zeros(3, 1).double()
+difflcs.violation_loss(m, x, u, x).backward()
+m(x, u).x_next.sum().backward()
+"""
+TASKS = """
+from difflcs.rl.tasks import get_task, task_names
+assert {"cube", "mug"} <= set(task_names())
+get_task("cube")
+"""
+# What a process does, one after the other, and what is not loaded by then besides what torch and NumPy load.
+STEPS = (
+    ("import sys, torch, numpy", ()),
+    ("import difflcs", (*HEAVY, "difflcs.zoo")),
+    ("difflcs.available_backends()", ("casadi", "cvxpy", "cvxpylayers")),
+    (CALLS, ("torch._dynamo",)),
+    ("from difflcs import zoo; zoo.card('trifinger-cube')", ("difflcs.rl", "safetensors", "gymnasium", "tyro")),
+    ("import difflcs.rl", ("torchrl", "tensordict")),
+    (TASKS, ("mujoco",)),
+)
+
+
 @pytest.fixture(scope="module")
-def imported():
-    """What a fresh process loads: with torch and NumPy, then by difflcs besides, then when solvers are asked for."""
-    before, after, asked = run("""
-import sys, torch, numpy
-print(*sys.modules)
-import difflcs
-print(*sys.modules)
-difflcs.available_backends()
-print(*sys.modules)
-""").splitlines()
-    return [set(names.split()) for names in (before, after, asked)]
+def loaded():
+    """Names of the modules after each step."""
+    return [set(names.split()) for names in run("\nprint(*sys.modules)\n".join([*dict(STEPS), ""])).splitlines()]
 
 
-def packages(modules):
-    return {name.split(".")[0] for name in modules}
-
-
-def test_import_loads_torch_and_numpy_alone(imported):
-    before, after, _ = imported
-    assert "difflcs" in after - before
-    assert not packages(after - before) & set(HEAVY)
-
-
-def test_solvers_are_imported_on_first_use_only(imported):
-    assert not packages(imported[2]) & {"casadi", "cvxpy", "cvxpylayers"}
+@pytest.mark.parametrize("step", range(1, len(STEPS)))
+def test_nothing_is_imported_before_it_is_needed(loaded, step):
+    assert "difflcs" in loaded[step]
+    assert not (loaded[step] - loaded[0]) & set(STEPS[step][1])
 
 
 def test_import_leaves_global_state_alone():
