@@ -15,7 +15,7 @@ Beyond the papers, `--axes any` turns by 30° to 90° about any axis, `--seconds
 reached, until the object falls or the time is over, and `--tilt 30` inclines the hand. They can be combined.
 
 The controller knows model and state, and tries each step in MuJoCo before it is executed. It has one set of settings,
-chosen with seeds below 1034; final figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE`
+chosen with seeds below 1500; final figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE`
 episodes that are in the file are not played again: after a change of the controller begin another file.
 """
 
