@@ -36,9 +36,9 @@ Start start_of(int64_t i) {
 
 // The first starts, which have no large actions.
 constexpr int64_t kNear = 2;
-// If of half of the starts, kHalf at least, kFound find the best plan and at most kLone end where no other does, to
-// kEqual of their cost, the search is over: what many find is rarely not the best. Starts after the first kFixed are
-// left where they seem not to come below the best cost by this part of it.
+// If of half of the starts, kHalf for each action at least, kFound find the best plan and at most kLone end where no
+// other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Starts after the first
+// kFixed are left where they seem not to come below the best cost by this part of it.
 constexpr int64_t kHalf = 8;
 constexpr double kEqual = 3e-4, kFound = 1.0 / 4.0, kLone = 1.0 / 8.0;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
@@ -391,7 +391,8 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
-  const int64_t starts = effort.starts, half = std::max(kHalf, starts / 2), shift = guessed ? 1 : 0;
+  const int64_t starts = effort.starts, half = std::max(kHalf * batch.n_u, starts / 2);
+  const int64_t shift = guessed ? 1 : 0;
   const MpcPlans to = shifted(batch, out, first);
 
   tried.resize(batch, 0);
