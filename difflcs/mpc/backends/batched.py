@@ -54,8 +54,8 @@ class BatchedBackend(Backend):
     compared after a few steps at the relaxation, and only those that may still win are solved to the end. The starts of
     an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
     long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. From
-    eight starts on a local search follows, unless they agree: the best plan is varied, above all a stage or more earlier
-    or later, until that finds nothing better.
+    eight starts on a local search follows, unless they agree: the best plan is varied, above all a stage or more
+    earlier or later, until that finds nothing better.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
