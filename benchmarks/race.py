@@ -471,7 +471,7 @@ def main(o: Options) -> None:
         results |= {name: alone[name](o)} if name in alone else dict(race(name, o))
         if name == "planners" and o.only:  # the rows of the others stay
             new = {family: {k: rows[k] for k in o.only if k in rows} for family, rows in results[name].items()}
-            results[name] = {family: {**old.get(family, {}), **rows} for family, rows in new.items()}
+            results[name] = {**old, **{family: {**old.get(family, {}), **rows} for family, rows in new.items()}}
         save(o.out, {"machine": machine(), "options": options, "results": results})
 
 

@@ -360,7 +360,7 @@ def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dic
     """Try settings for some CPU seconds, those of single plans, then random ones; the best three play for as long.
 
     They are compared by the costs of their plans under hard contact for problems that ours meets in three episodes, in
-    parts of what doing nothing costs more than ours; sampling in MuJoCo by 20 decisions of these episodes.
+    parts of what doing nothing costs more than ours; with the cube, and in MuJoCo, by 20 decisions of these episodes.
     """
     first, others = range(TUNING_SEED, TUNING_SEED + 3), range(TUNING_SEED + 3, TUNING_SEED + 23)
     play(loop, "ours", {}, first, math.inf, 20)
@@ -369,7 +369,7 @@ def tune(loop: Loop, label: str, module: str, draw: Draw, seconds: float) -> dic
     gain = (idle - ours).clamp_min(0.1 * float((idle - ours).mean()))
 
     def score(settings: dict[str, Any]) -> float:
-        if module == "simulated":
+        if module == "simulated" or isinstance(loop, Cube):
             return float(np.mean(play(loop, module, settings, first, math.inf, 20)["cost"]))
         plans = [Planner(module, settings, loop.imagine).solve(problem, None).primal.u for problem, _ in met]
         costs = torch.cat([hard_cost(problem, u) for (problem, _), u in zip(met, plans, strict=True)])

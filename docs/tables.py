@@ -138,20 +138,18 @@ def hard(record: dict) -> str:
     return table(["problems", "proved", "time of the search", *names], rows)
 
 
-def planners(record: dict) -> str:
-    """Planners by families: time of a plan, and mean gap to the best plan of all under hard contact."""
-    families = record["results"]["planners"]
+def by_family(families: dict[str, dict], cell: Callable[[dict], str]) -> str:
+    """Planners by families; — where one was not run."""
     rows = [
-        [
-            label,
-            *(
-                f"{duration(row[label]['seconds'])}, {percent(row[label]['gap'])}" if label in row else "—"
-                for row in families.values()
-            ),
-        ]
+        [label, *(cell(row[label]) if label in row else "—" for row in families.values())]
         for label in next(iter(families.values()))
     ]
     return table(["", *families], rows)
+
+
+def planners(record: dict) -> str:
+    """Planners by families: time of a plan, and mean gap to the best plan of all under hard contact."""
+    return by_family(record["results"]["planners"], lambda row: f"{duration(row['seconds'])}, {percent(row['gap'])}")
 
 
 def in_mujoco(record: dict) -> str:
@@ -162,7 +160,7 @@ def in_mujoco(record: dict) -> str:
         if row is None:
             return "—"
         low, high = (f"{100 * v:.0f}" for v in row["interval"])
-        new = f"{number(row['prepare_ms'])} + " if row["prepare_ms"] > 0.05 else ""
+        new = f"{number(row['prepare_ms'])} + " if row["prepare_ms"] > 0.05 * row["solve_ms"] else ""
         return (
             f"{100 * row['success']:.0f} % ({low}–{high}) of {row['episodes']}; {row['cost']:.2f} ± "
             f"{row['cost_half']:.2f}; {new}{number(row['solve_ms'])} ms"
@@ -177,11 +175,7 @@ def in_mujoco(record: dict) -> str:
 def loops(record: dict) -> str:
     """Planners by families with closed loops: time of a step, and the cost in parts of ours."""
     families = {name: row for name, row in record["results"]["planners"].items() if "step" in row["difflcs"]}
-    rows = [
-        [label, *(f"{duration(row[label]['step'])}, {row[label]['cost']:.2f}" for row in families.values())]
-        for label in next(iter(families.values()))
-    ]
-    return table(["", *families], rows)
+    return by_family(families, lambda row: f"{duration(row['step'])}, {row['cost']:.2f}")
 
 
 def versions(record: dict) -> str:
