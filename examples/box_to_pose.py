@@ -89,15 +89,13 @@ class Scene:
 
     Args:
         module: the system of the policy, which says what control an action is.
-        timestep: of the simulation [s].
 
     Attributes:
         goal: x, y [m] and yaw [rad] of the box.
     """
 
-    def __init__(self, module: MujocoLCS, timestep: float = 0.002):
+    def __init__(self, module: MujocoLCS):
         self.module, self.model = module, mujoco.MjModel.from_xml_string(WORLD.format(joints="<freejoint/>"))
-        self.model.opt.timestep = timestep
         self.data, self.goal = mujoco.MjData(self.model), np.zeros(3)
 
     def start(self, seed: int) -> None:
