@@ -27,6 +27,7 @@ Pairs = Sequence[tuple[int | str, int | str]]
 MOST_CONTACTS = 12  # by default
 _NEAR = 0.1  # of the unit of gaps: a contact as near as this is one that counts
 _ITERATIONS = 100  # of MuJoCo's distance
+_GAP_OFF = tuple(int(part) for part in mujoco.__version__.split(".")[:2]) < (3, 9)
 
 # Of these MuJoCo misses contacts that are apart, so that things would fall through.
 _FIELDS = (int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF))
@@ -131,6 +132,8 @@ class ContactFinder:
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
         _check_contacts(model, self.allowed, friction)
+        _warn_of_surfaces(model, self.allowed)
+        self._margin = _margins(model) * self.allowed
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
         kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
         if contacts is None:
@@ -204,6 +207,8 @@ class ContactFinder:
     def find(self, qpos: Array) -> MujocoContacts:
         """Find the contacts at positions (n, nq); those that are missing have a gap of `distance`, and zeros.
 
+        Gaps are distances less the margin at which MuJoCo's forces begin.
+
         Raises:
             InvalidInputError: MuJoCo raised an error.
         """
@@ -221,6 +226,7 @@ class ContactFinder:
             _mujoco.find_contacts(library(), self._scene, self._places.take(n), qpos, within, *found, near), n
         )
         self._warn_of_more(int(near.max(initial=0)))
+        found.gap[:] -= self._margin[found.geom[..., 0], found.geom[..., 1]]
         return found
 
     def _warn_of_more(self, near: int) -> None:
@@ -267,19 +273,42 @@ def plane_of_motion(model: Any, data: Any) -> Array | None:
 def _coefficients(model: Any, kind: int) -> Array:
     """Return the coefficients (ngeom, ngeom) of sliding (0), torsional (1) or rolling friction (2).
 
-    That of the geom of higher priority, else the larger, as MuJoCo does; zero where condim has no such friction.
+    That of the geom of higher priority, else the larger, or what overrides them; zero where condim has none.
     """
     first, second, dimensions = model.geom_priority[:, None], model.geom_priority[None], (2, 4, 6)[kind]
 
-    def of_pair(values: Any) -> Any:
+    def of_pair(values: Any, of_listed: Any) -> Any:
         larger = np.maximum(values[:, None], values[None])
-        return np.where(first == second, larger, np.where(first > second, values[:, None], values[None]))
+        table = np.where(first == second, larger, np.where(first > second, values[:, None], values[None]))
+        table[model.pair_geom1, model.pair_geom2] = table[model.pair_geom2, model.pair_geom1] = of_listed
+        return table
 
-    table = np.where(of_pair(model.geom_condim) >= dimensions, of_pair(model.geom_friction[:, kind]), 0.0)
-    for k in range(model.npair):
-        a, b = model.pair_geom1[k], model.pair_geom2[k]
-        table[a, b] = table[b, a] = model.pair_friction[k, (0, 2, 3)[kind]] * (model.pair_dim[k] >= dimensions)
-    return table
+    listed, overriding = (0, 2, 3)[kind], model.opt.enableflags & _OVERRIDE
+    friction = of_pair(model.geom_friction[:, kind], model.pair_friction[:, listed])
+    friction = np.full_like(friction, model.opt.o_friction[listed]) if overriding else friction
+    return np.where(of_pair(model.geom_condim, model.pair_dim) >= dimensions, friction, 0.0)
+
+
+def _margins(model: Any) -> Array:
+    """Return the distance (ngeom, ngeom) at which forces of geoms begin, from which MuJoCo before 3.9 took `gap`."""
+    geom, pair = model.geom_margin - model.geom_gap * _GAP_OFF, model.pair_margin - model.pair_gap * _GAP_OFF
+    table = geom[:, None] + geom
+    table[model.pair_geom1, model.pair_geom2] = table[model.pair_geom2, model.pair_geom1] = pair
+    return np.full_like(table, model.opt.o_margin) if model.opt.enableflags & _OVERRIDE else table
+
+
+def _warn_of_surfaces(model: Any, allowed: NDArray[np.bool_]) -> None:
+    """Warn if geoms that may touch have surfaces that move or stick, in MuJoCo 3.11 and later."""
+    for name in ("surfacevel", "adhesion"):
+        values = np.array(getattr(model, f"geom_{name}", np.zeros(model.ngeom)))
+        of_pair = getattr(model, f"pair_{name}", np.zeros(0))
+        if (values.any(-1) if values.ndim > 1 else values != 0)[allowed.any(0)].any() or of_pair.any():
+            warnings.warn(
+                f"expected surfaces that neither move nor stick, got {name} of geoms that may touch; it is left out, "
+                f"so that nothing is carried or held by it: give a conveyor a slide and a drive, or set {name} to zero",
+                ContactWarning,
+                stacklevel=4,
+            )
 
 
 def _warn_of_rolling(model: Any, rolling: Array) -> None:
@@ -304,17 +333,14 @@ def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | No
         )
     if friction is not None:
         return
-    if model.opt.enableflags & _OVERRIDE and allowed.any():
-        raise InvalidInputError(
-            'model: expected the friction of its geoms, got <flag override="enable"/>, which replaces it; pass '
-            f"friction={model.opt.o_friction[0]:g}, or take the flag away"
-        )
-    for k in range(model.npair):
-        a, b, along = model.pair_geom1[k], model.pair_geom2[k], model.pair_friction[k, :2]
-        if allowed[a, b] and model.pair_dim[k] > 1 and along[0] != along[1]:
+    overriding, pairs = model.opt.enableflags & _OVERRIDE, zip(model.pair_geom1, model.pair_geom2, strict=True)
+    listed = [(a, b, model.pair_friction[k]) for k, (a, b) in enumerate(pairs) if model.pair_dim[k] > 1]
+    for a, b, along in [(*ab, model.opt.o_friction) for ab in np.argwhere(allowed)[:1]] if overriding else listed:
+        if allowed[a, b] and along[0] != along[1]:
             raise InvalidInputError(
-                f"model: expected the same friction along both tangents of a <pair>, got {along[0]:g} and {along[1]:g} "
-                f"between geoms {_name(model, a)} and {_name(model, b)}; make them equal, or pass friction=..."
+                f"model: expected the same friction along both tangents of a <pair>, and of <flag override>, got "
+                f"{along[0]:g} and {along[1]:g} between geoms {_name(model, a)} and {_name(model, b)}; make them "
+                f"equal, or pass friction=..."
             )
 
 
@@ -339,7 +365,8 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
         excluded = (body[:, None] == signature >> 16) & (body[None] == signature & 0xFFFF)
         allowed &= ~(excluded | excluded.T)
     allowed[model.pair_geom1, model.pair_geom2] = allowed[model.pair_geom2, model.pair_geom1] = True
-    return allowed
+    moves = _moves(model).any(-1)[body]  # mocap bodies do not
+    return allowed & (moves[:, None] | moves)
 
 
 def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
@@ -381,12 +408,16 @@ def typical_radius(model: Any) -> float:
 
 def median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
     """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
-    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
-    for geom in range(model.ngeom):
-        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
-    first, second = pairs
-    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+    (first, second), apart = pairs, np.zeros(0)
+    for turns in (0.0, 1.0):  # a wheel on its axle gives way by its rim alone
+        jacobian, turn, gives = np.empty((3, model.nv)), np.empty((3, model.nv)), np.empty(model.ngeom)
+        for geom in range(model.ngeom):
+            mujoco.mj_jacGeom(model, data, jacobian, turn, geom)
+            rows = np.concatenate([jacobian, turns * model.geom_rbound[geom] * turn])
+            gives[geom] = np.trace(rows @ response @ rows.T) / dimensions
+        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+        if len(apart):
+            break
     if len(first) and not len(apart):
         raise InvalidInputError(
             "model: expected something that contact forces can move, got nothing; what is pushed needs joints "

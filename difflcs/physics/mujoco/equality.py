@@ -50,6 +50,7 @@ class Equality:
     def __init__(self, model: Any, data: Any):
         self._taken, self.model = data, copy.copy(model)
         self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        self.model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)  # others may know R only later in a step
         self.model.opt.disableflags |= flags("CONTACT", "LIMIT", "FRICTIONLOSS")
         self.data = mujoco.MjData(self.model)
 

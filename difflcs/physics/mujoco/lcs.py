@@ -39,6 +39,7 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first that a module is asked for
+_USUAL = 2.0  # actions that are tried where there is no range; of servos on slides in units of `length`
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -61,9 +62,10 @@ class MujocoLCS:
     joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
     without, is a bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
 
-    Not in the system: margins of geoms, and with a `ContactWarning` rolling friction. Refused: adhesion, delay, sleep,
-    height fields and signed distance fields that may touch something, friction that override sets or that is not the
-    same in all directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the state.
+    Not in the system, with a `ContactWarning`: rolling friction, surfaces that move or stick. Refused: actuators that
+    adhere, delay, sleep, springs that yield, height fields and signed distance fields that may touch something,
+    friction that is not the same in all directions; in quasi-static motion disabled actuators. The matrices carry no
+    gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -413,16 +415,18 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
         return
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
     ends = torch.from_numpy(of._actuators.range)[:, None] - of.control(x, torch.zeros_like(idle))
-    near = idle + torch.from_numpy(of._actuators.usual)[:, None]
-    ends = torch.where(ends.isfinite(), ends, near).clamp(*of.action_bounds(x))
-    u = torch.cat([ends, 0.5 * (ends + idle)])
-    ctrl, nv = of.control(x.expand(4, *x.shape), u).reshape(-1, of.n_u).numpy(), of.state.nv
-    states, unstable = np.tile(read.states[some], (4, 1)), np.tile(read.moved.unstable[some], 4)
+    usual = _USUAL * torch.from_numpy(np.where(of._actuators.slides, of.length, 1.0))
+    ends = torch.where(ends.isfinite(), ends, idle + torch.stack([-usual, usual])[:, None])
+    ends = torch.cat([ends, torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))])
+    u = torch.cat([ends, 0.5 * (ends + idle), torch.zeros_like(ends[:1])]).clamp(*of.action_bounds(x))
+    m, nv = len(u), of.state.nv
+    ctrl = of.control(x.expand(m, *x.shape), u).reshape(-1, of.n_u).numpy()
+    states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
     after = of._whole.simulate(of._places, states, ctrl)
     free = of._motion.simulate(of._places, states, ctrl, unstable)
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-    predicted = advance(LCSParams.of_checked(flat), x.expand(4, *x.shape), u).x_next.numpy()
-    at, to, alone = (v.reshape(4, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
+    predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
+    at, to, alone = (v.reshape(m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
     warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], of._model)
 
 

@@ -39,11 +39,12 @@ Array = NDArray[np.float64]
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
 _FINER = 4  # how many steps for one of MuJoCo's where these are unstable
 _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
-_EULER, _RK4, _IMPLICIT, _FAST = (
-    int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
+_EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and later
+    int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}", -1))
+    for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 )
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
-_ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit"}
+_ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
 
 
 class QuasiStatic:
@@ -155,6 +156,9 @@ class Dynamic:
         self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
         damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
+        # Of any action, as a drive may be stiffer there.
+        implicit = self.simulated.integrator in (_IMPLICIT, _FAST)
+        self.stable = self.simulated if implicit else Steps(self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
         self._native: dict[Steps, _mujoco.Motion] = {}
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
@@ -184,6 +188,7 @@ class Dynamic:
     def find_secants(self, read: Linearised, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Add lines nearest to both ends of ranges, for actuators whose force is not linear in `ctrl` (n, nu)."""
         secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
+        reached = self.simulate(places, states, ctrl, read.unstable)
         for k, i in enumerate(self.actuators.curved):
             ends = self.actuators.range[:, i, None] - ctrl[:, i]
             for end in ends:
@@ -191,17 +196,17 @@ class Dynamic:
                 other[:, i] += end
                 after = self.simulate(places, states, other, read.unstable)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
+                    secants[:, :, k] += (after - reached) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
 
     def simulate(self, places: Places, states: Array, ctrl: Array, unstable: NDArray[np.bool_]) -> Array:
-        """Return ζ, ν and the change of activation (n, n_x) after a step at controls (n, nu), see `read`."""
+        """Return ζ, ν and the change of activation (n, n_x) after implicit steps at controls (n, nu), see `read`."""
         after = np.empty((len(states), 2 * self.model.nv + self.model.na))
-        for steps, some in ((self.simulated, ~unstable), (self.finer, unstable)):
+        for steps, some in ((self.stable, ~unstable), (self.finer, unstable)):
             if some.any():
                 part = after[some]
                 taken = places.take(len(part)), states[some], ctrl[some], part
-                places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
+                places.check(_mujoco.simulate(library(), self._described(steps), *taken), len(part))
                 after[some] = part
         return after
 
@@ -210,10 +215,14 @@ class Dynamic:
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
+        native = self._described(steps)
+        places.check(_mujoco.read_motion(library(), native, places.take(n), states, ctrl, *arrays), n)
+        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
+
+    def _described(self, steps: Steps) -> _mujoco.Motion:
         if steps not in self._native:
             self._native[steps] = self.describe(steps, self.flags)
-        places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
-        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
+        return self._native[steps]
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
@@ -243,6 +252,8 @@ class Dynamic:
         simulated.opt.disableflags |= disabled
         simulated.opt.timestep = self.seconds / steps.count
         simulated.opt.integrator = steps.integrator
+        if steps.integrator == _DISCRETE:  # whose acceleration is that of the whole step
+            simulated.opt.disableflags |= flags("EULERDAMP")
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
         linearised.opt.disableflags |= self.flags | flags("EULERDAMP")
         linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
