@@ -61,8 +61,8 @@ def test_the_nearest_of_many_pairs_are_those_of_all_pairs():
 
 
 SETTINGS = {
-    "margins": ('margin=".1" gap=".05"', "", {}),
-    "a pair": ('contype="0" conaffinity="0"', '<contact><pair geom1="a" geom2="b" margin=".2"/></contact>', {}),
+    "a gap": ('gap=".05"', "", {}),
+    "a pair": ('contype="0" conaffinity="0"', '<contact><pair geom1="a" geom2="b" gap=".2"/></contact>', {}),
     "names": ('contype="0" conaffinity="0"', "", {"pairs": [("a", "b")]}),
     "another algorithm": ("", '<option ccd_iterations="3"><flag nativeccd="disable"/></option>', {}),
     "a mesh for the eye": ('type="mesh" mesh="seen" contype="0" conaffinity="0"', "", {"pairs": [("a", "b")]}),

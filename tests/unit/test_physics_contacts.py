@@ -145,3 +145,58 @@ def test_rolling_friction_is_left_out_with_a_warning():
     with pytest.warns(ContactWarning, match=r"rolling friction \(condim 6\).*up to 0.0001.*condim 4"):
         module = MujocoLCS(mujoco.MjModel.from_xml_string(SPINNING.format(6)), motion="dynamic")
     assert module.n_lam == 6
+
+
+BALL = """<mujoco><option {option}</option><worldbody><geom name="floor" type="plane" size="1 1 1" {floor}/>
+  <body pos="0 0 .099"><joint {joint}/><geom name="ball" size=".1" mass="1"/></body></worldbody>{rest}</mujoco>"""
+
+
+def step_of(option=">", floor="", joint='type="slide" axis="0 0 1"', rest=""):
+    """A ball that touches a floor: its module, and its state after 20 ms beside MuJoCo's."""
+    model = mujoco.MjModel.from_xml_string(BALL.format(option=option, floor=floor, joint=joint, rest=rest))
+    data = mujoco.MjData(model)
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
+    x = module.observe(data)
+    after = module.params(x).step(x, torch.zeros(0).double()).x_next
+    mujoco.mj_step(model, data, 10)
+    return module, after, module.state.to_state(data.qpos, data.qvel)
+
+
+MARGINS = {
+    "of geoms": {"floor": 'margin=".02"'},
+    "of a pair": {"rest": '<contact><pair geom1="floor" geom2="ball" margin=".02"/></contact>'},
+    "by override": {"option": 'o_margin=".02" o_friction=".3 .3 0 0 0"><flag override="enable"/>'},
+}
+
+
+@pytest.mark.parametrize("kind", MARGINS)
+def test_contacts_act_from_the_margin_on(kind):
+    module, after, true = step_of(**MARGINS[kind])
+    assert module.contacts(torch.zeros(2).double()).gap.tolist() == pytest.approx([-0.021])
+    torch.testing.assert_close(after, true, rtol=0.35, atol=1e-3)
+
+
+INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast", "discrete")
+
+
+@pytest.mark.parametrize("name", [k for k in INTEGRATORS if hasattr(mujoco.mjtIntegrator, f"mjINT_{k.upper()}")])
+def test_a_step_is_that_of_the_integrator(name):
+    hinge = 'name="a" type="hinge" axis="1 0 0" pos="0 0 .2" stiffness="500" springref="20" damping=".1"'
+    held = '<equality><joint joint1="a" solref=".1 1" solimp=".5 .5"/></equality>'
+    _, after, true = step_of(f'integrator="{name}">', 'contype="0" conaffinity="0"', hinge, held)
+    assert true[1] > 0.5
+    torch.testing.assert_close(after, true, rtol=0.03, atol=1e-6)
+
+
+def test_a_wheel_on_its_axle_rubs():
+    module, after, true = step_of(joint='type="hinge" axis="1 0 0"')
+    assert module.n_lam == 2
+    torch.testing.assert_close(after, true)
+
+
+@pytest.mark.parametrize("surface", ['surfacevel="1 0 0 0 0 0"', 'adhesion="5"'])
+def test_surfaces_that_move_or_stick_are_left_out_with_a_warning(surface):
+    if not hasattr(mujoco.MjModel, f"geom_{surface.split('=')[0]}"):
+        pytest.skip("MuJoCo 3.11 and later")
+    with pytest.warns(ContactWarning, match="neither move nor stick"):
+        step_of(floor=surface)

@@ -459,6 +459,9 @@ if SINCE_MUJOCO_4:
     motor = '<actuator><dcmotor joint="px" motorconst=".1" resistance="1" inductance="1e-3"/></actuator>'
     RESTS["a motor with a state"] = (motor, {}, "activation")
     RESTS["sleep"] = (FLAG.format("sleep", "enable"), {}, "sleep")
+if hasattr(mujoco.MjModel, "nplastic"):
+    rope = '<tendon><fixed stiffness="1" springyield=".1"><joint joint="px" coef="1"/></fixed></tendon>'
+    RESTS["a spring that yields"] = (SERVOS + rope, {}, "springs that do not yield")
 
 
 @pytest.mark.parametrize("case", RESTS)

@@ -39,7 +39,7 @@ class Actuators:
         follows: (nu,) True if it has no activation, or one that goes to its control.
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
-        slides: (nu,) True for a servo on a slide.
+        usual: (nu,) size of actions where there is no range: 1, and none of a servo on a slide, for a metre.
         curved: (k,) those with a range whose force is not linear in the control, such as dampers and muscles.
     """
 
@@ -65,7 +65,8 @@ class Actuators:
         limited &= not model.opt.disableflags & flags("CLAMPCTRL")
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
-        self.slides = self.holds & (self.dof >= 0) & (model.jnt_type[model.dof_jntid[self.dof]] == _SCALAR[0])
+        slides = self.holds & (self.dof >= 0) & (model.jnt_type[model.dof_jntid[self.dof]] == _SCALAR[0])
+        self.usual = np.where(slides, 0.0, 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
         plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))

@@ -18,6 +18,7 @@ from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
 from difflcs.physics.mujoco.native import copy_taken, flags, native
 
 Array = NDArray[np.float64]
+_FIRMEST = 1e-8  # least R, in parts of what it stands beside
 _DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
 
 
@@ -73,7 +74,10 @@ class Equality:
                 if not data.nefc:
                     return None
                 jacobian = data.efc_J.reshape(-1, model.nv)
-                rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, :3], data.efc_R)])
+                gives = np.empty_like(jacobian)
+                mujoco.mj_solveM(model, data, gives, jacobian)
+                firm = np.maximum(data.efc_R, _FIRMEST * (gives * jacobian).sum(-1))
+                rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, :3], firm)])
         gap, normal, reference, regularisation = map(np.stack, zip(*rows, strict=True))
         if moved is not None:
             gap = gap - (normal @ moved[:, :, None])[:, :, 0]

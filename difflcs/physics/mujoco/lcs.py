@@ -39,7 +39,6 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first that a module is asked for
-_USUAL = 2.0  # actions that are tried where there is no range; of servos on slides in units of `length`
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -333,7 +332,8 @@ class MujocoLCS:
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        moved = self._read_motion(np.concatenate([data.qpos, data.qvel, data.act])[None], self._ctrl[None])
+        qpos = data.qpos.copy()
+        moved = self._read_motion(np.concatenate([qpos, data.qvel, data.act])[None], self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
@@ -342,6 +342,8 @@ class MujocoLCS:
             impulse = self._motion.finish(moved, x).response[0]
             response = self.seconds * impulse
             self._yields = self._actuators.yields(self.seconds * response, response)
+        data.qpos[:] = qpos  # which has moved
+        mujoco.mj_fwdPosition(model, data)
         pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
         return median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
 
@@ -415,10 +417,12 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
         return
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
     ends = torch.from_numpy(of._actuators.range)[:, None] - of.control(x, torch.zeros_like(idle))
-    usual = _USUAL * torch.from_numpy(np.where(of._actuators.slides, of.length, 1.0))
+    usual = torch.from_numpy(of._actuators.usual)
     ends = torch.where(ends.isfinite(), ends, idle + torch.stack([-usual, usual])[:, None])
     ends = torch.cat([ends, torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))])
-    u = torch.cat([ends, 0.5 * (ends + idle), torch.zeros_like(ends[:1])]).clamp(*of.action_bounds(x))
+    # Servos on tendons and sites have absolute targets, which may be far from where they are.
+    absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)
+    u = torch.cat([ends, 0.5 * (ends + idle), torch.where(absolute, 0.0, idle)[None]]).clamp(*of.action_bounds(x))
     m, nv = len(u), of.state.nv
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(-1, of.n_u).numpy()
     states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)

@@ -25,7 +25,6 @@ import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
@@ -37,6 +36,7 @@ from difflcs.physics.mujoco.native import flags, native
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
+_FAST_MOTION = 100.0  # a motion in a step [m, rad] or velocity that may be that of unstable steps
 _FINER = 4  # how many steps for one of MuJoCo's where these are unstable
 _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and later
@@ -152,13 +152,10 @@ class Dynamic:
         self.moment = np.zeros((model.nu, model.nv))
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
         self.steps = Steps(max(1, round(seconds / model.opt.timestep)), int(model.opt.integrator))
-        coarse = self.steps.integrator if self.steps.integrator == _RK4 else _IMPLICIT
+        coarse = self.steps.integrator if self.steps.integrator in (_RK4, _DISCRETE) else _IMPLICIT
         self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
         damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
-        # Of any action, as a drive may be stiffer there.
-        implicit = self.simulated.integrator in (_IMPLICIT, _FAST)
-        self.stable = self.simulated if implicit else Steps(self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
         self._native: dict[Steps, _mujoco.Motion] = {}
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
@@ -188,7 +185,6 @@ class Dynamic:
     def find_secants(self, read: Linearised, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Add lines nearest to both ends of ranges, for actuators whose force is not linear in `ctrl` (n, nu)."""
         secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
-        reached = self.simulate(places, states, ctrl, read.unstable)
         for k, i in enumerate(self.actuators.curved):
             ends = self.actuators.range[:, i, None] - ctrl[:, i]
             for end in ends:
@@ -196,13 +192,17 @@ class Dynamic:
                 other[:, i] += end
                 after = self.simulate(places, states, other, read.unstable)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    secants[:, :, k] += (after - reached) * (end / (ends**2).sum(0))[:, None]
+                    secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
 
     def simulate(self, places: Places, states: Array, ctrl: Array, unstable: NDArray[np.bool_]) -> Array:
-        """Return ζ, ν and the change of activation (n, n_x) after implicit steps at controls (n, nu), see `read`."""
-        after = np.empty((len(states), 2 * self.model.nv + self.model.na))
-        for steps, some in ((self.stable, ~unstable), (self.finer, unstable)):
+        """Return ζ, ν and the change of activation (n, n_x) after a step at controls (n, nu), see `read`.
+
+        What becomes fast is simulated in finer steps as well, as drives may be stiffer with another action.
+        """
+        after = np.full((len(states), 2 * self.model.nv + self.model.na), np.inf)
+        for steps, some in ((self.simulated, ~unstable), (self.finer, None)):
+            some = ~(np.abs(after).max(1) < _FAST_MOTION) if some is None else some
             if some.any():
                 part = after[some]
                 taken = places.take(len(part)), states[some], ctrl[some], part
@@ -227,6 +227,8 @@ class Dynamic:
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
         nv, h = self.model.nv, self.seconds / self.simulated.count
+        if self.simulated.integrator == _DISCRETE:
+            return np.zeros(len(read.A), dtype=bool)
         stiff, damped = read.A[:, nv : 2 * nv, :nv], read.A[:, nv : 2 * nv, nv : 2 * nv] - np.eye(nv)
         # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
         g = _GROWS ** (1 / self.simulated.count)
@@ -282,7 +284,8 @@ class Dynamic:
             inverse_mass = np.linalg.inv(heavier).astype(np.float64)
         response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
-        step, implicit = self._steps(mass, forces, damping, self.steps), self._implicit(response @ heavier, forces)
+        held = heavier if self.steps.integrator == _DISCRETE else mass
+        step, implicit = self._steps(held, forces, damping, self.steps), self._implicit(response @ heavier, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
         same = self.simulated == self.steps and equality is None
@@ -314,15 +317,19 @@ class Dynamic:
         h, one = self.seconds / steps.count, np.zeros((n, of, of))
         activation = self.actuators.durations(h)[:, None] * forces[:, nv:]
         if steps.integrator == _RK4:
-            unit = np.ones(of)
-            unit[nv : 2 * nv] = h  # of (ζ, h ν) the norm, which says what an exponential costs, is less
             one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces[:, :nv]
-            one[:, 2 * nv : n_x] = activation
-            grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(one * unit[:, None] / unit))
-            one = grown.numpy() * unit / unit[:, None]
+            one[:, 2 * nv : n_x], grown = activation, np.eye(of)
+            for k in (4, 3, 2, 1):
+                grown = np.eye(of) + one @ grown / k
+            one = grown
         else:
-            one[:] = np.eye(of)
-            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ forces[:, :nv])
+            rates, one[:] = forces[:, :nv].copy(), np.eye(of)
+            if steps.integrator == _DISCRETE:  # at the position after the step
+                rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
+                response = _implicit_response(mass, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+                one[:, nv : 2 * nv] += h * response @ mass @ rates
+            else:
+                one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ rates)
             one[:, :nv] += h * one[:, nv : 2 * nv]
             one[:, 2 * nv : n_x] += activation
         with np.errstate(over="ignore", invalid="ignore"):
