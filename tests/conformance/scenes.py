@@ -1,9 +1,10 @@
 """Random small MuJoCo scenes: one step of `MujocoLCS` against MuJoCo's, judged by what doing nothing would give.
 
-Trees of bodies with all kinds of joints, shapes, limits, friction, actuators, tendons and equality constraints move at
-random for a while; then comes one step with a random action. A fault is silent where the system is made without an
-error or a warning, and is not finite, or its velocity is farther from MuJoCo's than the velocity before the step: by
-more than a tolerance, in the norm of kinetic energy. An exception that is none of the library's counts as well.
+Trees of bodies with all kinds of joints, shapes, limits, friction, actuators, tendons and equality constraints, from
+millimetres to metres, move at random for a while; then comes one step with a random action. A fault is silent where
+the system is made without an error or a warning, and is not finite, or its velocity is farther from MuJoCo's than the
+velocity before the step: by more than a tolerance, in the norm of kinetic energy. An exception that is none of the
+library's counts as well.
 
 python -m tests.conformance.scenes --count 20000
 python -m tests.conformance.scenes --first 17 --count 1
@@ -254,10 +255,10 @@ def random_scene(seed: int) -> tuple[Any, Any, np.random.Generator] | None:
 
 
 def draw(model: Any, random: np.random.Generator) -> np.ndarray:
-    """Random controls: in their ranges, about zero, or of servos on slides within a decimetre."""
+    """Random controls: in their ranges; else within ±1, about zero, and of servos on slides within a decimetre."""
     low, high = model.actuator_ctrlrange.T
     on_slide = (model.actuator_trntype == 0) & (model.jnt_type[model.actuator_trnid[:, 0]] == 2)
-    free = random.normal(size=model.nu) * np.where(on_slide & (model.actuator_biasprm[:, 1] < 0), 0.1, 1.0)
+    free = random.normal(size=model.nu).clip(-1, 1) * np.where(on_slide & (model.actuator_biasprm[:, 1] < 0), 0.1, 1.0)
     return np.where(model.actuator_ctrllimited, random.uniform(low, np.maximum(low, high)), free)
 
 
