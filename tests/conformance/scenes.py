@@ -100,9 +100,8 @@ class Writer:
         self.geoms.append(kind)
         text += f' friction="{self.random.uniform(0, 1.2):.3g}"' + self.soft(0.15)
         text += self.maybe(0.2, f' condim="{self.random.choice([1, 4, 6])}"') + self.maybe(0.05, ' priority="1"')
-        text += self.maybe(0.1, f' margin="{0.01 * self.size:.4g}"') + self.maybe(
-            0.05, f' gap="{0.01 * self.size:.4g}"'
-        )
+        far = f'="{0.01 * self.size:.4g}"'
+        text += self.maybe(0.1, f" margin{far}") + self.maybe(0.05, f" gap{far}")
         text += self.maybe(0.1, f' contype="{self.random.integers(4)}" conaffinity="{self.random.integers(4)}"')
         text += self.maybe(0.01, f' adhesion="{self.log(-1, 1)}"') + self.maybe(0.01, ' surfacevel=".3 0 0 0 0 1"')
         return text + "/>"
@@ -176,8 +175,7 @@ class Writer:
         other = self.maybe(0.5 * (one != two), f'body2="{two}"')
         kinds = [f'<weld body1="{one}" {other} {soft} {off}/>']
         kinds.append(f'<connect body1="{one}" {other} anchor="{self.vector(0.05 * self.size)}" {soft} {off}/>')
-        if one != two:
-            kinds += [f'<connect site1="{one}" site2="{two}" {soft} {off}/>']
+        kinds += [f'<connect site1="{one}" site2="{two}" {soft} {off}/>'] * (one != two)
         if len(self.scalar) > 1:
             pair = self.random.choice(self.scalar, 2, replace=False)
             curve = f'polycoef="0 {self.vector(1, 1)} {self.vector(0.3, 1)} 0 0"'
@@ -189,10 +187,8 @@ class Writer:
         """Pairs of geoms that touch in their own way, or bodies that do not."""
         one, two = (int(k) for k in self.random.permutation(len(self.geoms))[:2])
         pair = f'<pair geom1="g{one}" geom2="g{two}" condim="{self.random.choice([1, 3, 4])}"{self.soft(0.3)}'
-        pair += (
-            self.maybe(0.3, f' margin="{0.01 * self.size:.4g}"') + self.maybe(0.3, ' friction=".5 .5 .01 0 0"') + "/>"
-        )
-        return self.maybe(0.5, pair) + self.maybe(0.5 * (self.bodies > 1), '<exclude body1="b0" body2="b1"/>')
+        pair += self.maybe(0.3, f' margin="{0.01 * self.size:.4g}"') + self.maybe(0.3, ' friction=".5 .5 .01 0 0"')
+        return self.maybe(0.5, pair + "/>") + self.maybe(0.5 * (self.bodies > 1), '<exclude body1="b0" body2="b1"/>')
 
     def scene(self) -> str:
         """The whole."""

@@ -189,14 +189,12 @@ def test_a_step_is_that_of_the_integrator(name):
 
 
 def test_a_wheel_on_its_axle_rubs():
-    module, after, true = step_of(joint='type="hinge" axis="1 0 0"')
-    assert module.n_lam == 2
+    _, after, true = step_of(joint='type="hinge" axis="1 0 0"')
     torch.testing.assert_close(after, true)
 
 
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "geom_adhesion"), reason="MuJoCo 3.11 and later")
 @pytest.mark.parametrize("surface", ['surfacevel="1 0 0 0 0 0"', 'adhesion="5"'])
 def test_surfaces_that_move_or_stick_are_left_out_with_a_warning(surface):
-    if not hasattr(mujoco.MjModel, f"geom_{surface.split('=')[0]}"):
-        pytest.skip("MuJoCo 3.11 and later")
     with pytest.warns(ContactWarning, match="neither move nor stick"):
         step_of(floor=surface)

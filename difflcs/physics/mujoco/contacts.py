@@ -132,7 +132,6 @@ class ContactFinder:
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
         _check_contacts(model, self.allowed, friction)
-        _warn_of_surfaces(model, self.allowed)
         self._margin = _margins(model) * self.allowed
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
         kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
@@ -144,7 +143,8 @@ class ContactFinder:
         self._spin = _coefficients(model, 1) / np.where(self.friction > 0, self.friction, np.inf)
         if torsion and self.n_tangents == 2:
             self.n_tangents += bool(self._spin[first, second].any())
-            _warn_of_rolling(model, _coefficients(model, 2)[first, second])
+        rolling = _coefficients(model, 2)[first, second] * (torsion and self.n_tangents > 1)
+        _warn_of_left_out(model, self.allowed, rolling)
         rough = [budget.friction or not self.n_tangents for budget in budgets]
         self.rough = np.repeat(rough, [budget.contacts for budget in budgets])
         model.opt.ccd_iterations = _ITERATIONS
@@ -297,29 +297,21 @@ def _margins(model: Any) -> Array:
     return np.full_like(table, model.opt.o_margin) if model.opt.enableflags & _OVERRIDE else table
 
 
-def _warn_of_surfaces(model: Any, allowed: NDArray[np.bool_]) -> None:
-    """Warn if geoms that may touch have surfaces that move or stick, in MuJoCo 3.11 and later."""
-    for name in ("surfacevel", "adhesion"):
-        values = np.array(getattr(model, f"geom_{name}", np.zeros(model.ngeom)))
-        of_pair = getattr(model, f"pair_{name}", np.zeros(0))
-        if (values.any(-1) if values.ndim > 1 else values != 0)[allowed.any(0)].any() or of_pair.any():
-            warnings.warn(
-                f"expected surfaces that neither move nor stick, got {name} of geoms that may touch; it is left out, "
-                f"so that nothing is carried or held by it: give a conveyor a slide and a drive, or set {name} to zero",
-                ContactWarning,
-                stacklevel=4,
-            )
-
-
-def _warn_of_rolling(model: Any, rolling: Array) -> None:
-    """Warn if pairs that may touch have coefficients of rolling friction."""
-    if rolling.any():
-        warnings.warn(
-            f"expected no rolling friction (condim 6), got coefficients of up to {rolling.max():g}; it is left out, so "
-            f"that what rolls goes on rolling: give these geoms and pairs condim 4 if this does not matter",
-            ContactWarning,
-            stacklevel=4,
+def _warn_of_left_out(model: Any, allowed: NDArray[np.bool_], rolling: Array) -> None:
+    """Warn if pairs (ngeom, ngeom) that may touch have what is left out, such as these coefficients of rolling."""
+    left = {
+        f"no rolling friction (condim 6), got coefficients of up to {rolling.max(initial=0.0):g}; it is left out, so "
+        f"that what rolls goes on rolling: give these geoms and pairs condim 4 if this does not matter": rolling
+    }
+    for name in ("surfacevel", "adhesion"):  # of MuJoCo 3.11 and later
+        of_geoms, of_pairs = (getattr(model, f"{of}_{name}", np.zeros(0)) for of in ("geom", "pair"))
+        text = (
+            f"surfaces that neither move nor stick, got {name} of geoms that may touch; it is left out: set it to zero"
         )
+        left[text] = np.append(of_geoms[allowed.any(0)] if len(of_geoms) else of_geoms, of_pairs)
+    for text, values in left.items():
+        if values.any():
+            warnings.warn(f"expected {text}", ContactWarning, stacklevel=4)
 
 
 def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | None) -> None:
@@ -408,16 +400,12 @@ def typical_radius(model: Any) -> float:
 
 def median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
     """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
-    (first, second), apart = pairs, np.zeros(0)
-    for turns in (0.0, 1.0):  # a wheel on its axle gives way by its rim alone
-        jacobian, turn, gives = np.empty((3, model.nv)), np.empty((3, model.nv)), np.empty(model.ngeom)
-        for geom in range(model.ngeom):
-            mujoco.mj_jacGeom(model, data, jacobian, turn, geom)
-            rows = np.concatenate([jacobian, turns * model.geom_rbound[geom] * turn])
-            gives[geom] = np.trace(rows @ response @ rows.T) / dimensions
-        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
-        if len(apart):
-            break
+    jacobians, gives, (first, second) = np.empty((2, 3, model.nv)), np.empty((2, model.ngeom)), pairs
+    for geom in range(model.ngeom):
+        mujoco.mj_jacGeom(model, data, *jacobians, geom)
+        gives[:, geom] = [np.trace(jacobian @ response @ jacobian.T) / dimensions for jacobian in jacobians]
+    gives[1] *= model.geom_rbound**2  # a wheel on its axle gives way by its rim alone
+    apart = next((way[way > 0] for way in gives[:, first] + gives[:, second] if (way > 0).any()), np.zeros(0))
     if len(first) and not len(apart):
         raise InvalidInputError(
             "model: expected something that contact forces can move, got nothing; what is pushed needs joints "

@@ -320,7 +320,10 @@ class MujocoLCS:
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        moved = _find_secants(self, self._read_motion(states, ctrl), flat, states)
+        moved = self._read_motion(states, ctrl)
+        if isinstance(self._motion, Dynamic) and self._actuators.curved.size:
+            idle = self.control(torch.from_numpy(flat), torch.from_numpy(moved.nominal)).numpy()
+            moved = self._motion.find_secants(moved, self._places, states, idle)
         return _States(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
@@ -420,8 +423,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     usual = torch.from_numpy(of._actuators.usual)
     ends = torch.where(ends.isfinite(), ends, idle + torch.stack([-usual, usual])[:, None])
     ends = torch.cat([ends, torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))])
-    # Servos on tendons and sites have absolute targets, which may be far from where they are.
-    absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)
+    absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)  # far from zero, perhaps
     u = torch.cat([ends, 0.5 * (ends + idle), torch.where(absolute, 0.0, idle)[None]]).clamp(*of.action_bounds(x))
     m, nv = len(u), of.state.nv
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(-1, of.n_u).numpy()
@@ -432,14 +434,6 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
     at, to, alone = (v.reshape(m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
     warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], of._model)
-
-
-def _find_secants(of: MujocoLCS, moved: Any, x: Any, states: Any) -> Any:
-    """Add those of actuators whose force is not linear in the control, in dynamic motion."""
-    if not isinstance(of._motion, Dynamic) or not of._actuators.curved.size:
-        return moved
-    idle = of.control(torch.from_numpy(x), torch.from_numpy(moved.nominal)).numpy()
-    return of._motion.find_secants(moved, of._places, states, idle)
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

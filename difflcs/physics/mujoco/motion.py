@@ -157,13 +157,13 @@ class Dynamic:
         damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
-        self._native: dict[Steps, _mujoco.Motion] = {}
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)
         self.firm = np.isin(
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONSTRAINT")
+        self._native = {steps: self.describe(steps, self.flags) for steps in (self.simulated, self.finer)}
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
@@ -206,7 +206,7 @@ class Dynamic:
             if some.any():
                 part = after[some]
                 taken = places.take(len(part)), states[some], ctrl[some], part
-                places.check(_mujoco.simulate(library(), self._described(steps), *taken), len(part))
+                places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
                 after[some] = part
         return after
 
@@ -215,14 +215,8 @@ class Dynamic:
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
-        native = self._described(steps)
-        places.check(_mujoco.read_motion(library(), native, places.take(n), states, ctrl, *arrays), n)
+        places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
         return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
-
-    def _described(self, steps: Steps) -> _mujoco.Motion:
-        if steps not in self._native:
-            self._native[steps] = self.describe(steps, self.flags)
-        return self._native[steps]
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
