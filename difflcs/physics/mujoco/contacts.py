@@ -357,8 +357,8 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
         excluded = (body[:, None] == signature >> 16) & (body[None] == signature & 0xFFFF)
         allowed &= ~(excluded | excluded.T)
     allowed[model.pair_geom1, model.pair_geom2] = allowed[model.pair_geom2, model.pair_geom1] = True
-    moves = _moves(model).any(-1)[body]  # mocap bodies do not
-    return allowed & (moves[:, None] | moves)
+    moves = _moves(model)[body].any(-1, keepdims=True)  # mocap bodies do not
+    return allowed & (moves | moves.T)
 
 
 def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
@@ -398,8 +398,10 @@ def typical_radius(model: Any) -> float:
     return float(np.median(chosen)) if len(chosen) else 1.0
 
 
-def median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
-    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
+def median_apart(model: Any, data: Any, state: Array, response: Any, pairs: Any, dimensions: int) -> float:
+    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response at a state."""
+    data.qpos[:] = state[: model.nq]
+    mujoco.mj_fwdPosition(model, data)
     jacobians, gives, (first, second) = np.empty((2, 3, model.nv)), np.empty((2, model.ngeom)), pairs
     for geom in range(model.ngeom):
         mujoco.mj_jacGeom(model, data, *jacobians, geom)

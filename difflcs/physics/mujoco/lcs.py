@@ -56,17 +56,13 @@ class MujocoLCS:
 
     Directions in which no joint can move are not in the Jacobians. Where all joints move in one plane, friction has
     one tangent, in this plane, and contacts across it, such as those of a floor below, are left out.
-
     Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state. Limits of
     joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
     without, is a bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
-
-    Not in the system, with a `ContactWarning`: rolling friction, surfaces that move or stick. Refused: actuators that
-    adhere, delay, sleep, springs that yield, height fields and signed distance fields that may touch something,
-    friction that is not the same in all directions; in quasi-static motion disabled actuators. The matrices carry no
-    gradient of the state.
-
-    An object keeps one private copy of the model and its data, so use it from one thread at a time.
+    Not in the system, with a `ContactWarning`: rolling friction, surfaces that move or stick. Refused: <adhesion>,
+    delay, sleep, springs that yield, height fields and signed distance fields that may touch something, friction that
+    differs by direction; in quasi-static motion disabled actuators. The matrices carry no gradient of the state. An
+    object keeps one private copy of the model and its data, so use it from one thread at a time.
 
     Args:
         model: the MuJoCo model.
@@ -321,9 +317,8 @@ class MujocoLCS:
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
         moved = self._read_motion(states, ctrl)
-        if isinstance(self._motion, Dynamic) and self._actuators.curved.size:
-            idle = self.control(torch.from_numpy(flat), torch.from_numpy(moved.nominal)).numpy()
-            moved = self._motion.find_secants(moved, self._places, states, idle)
+        if isinstance(self._motion, Dynamic):
+            moved = self._motion.find_secants(moved, self._places, states, flat)
         return _States(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
@@ -335,8 +330,8 @@ class MujocoLCS:
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        qpos = data.qpos.copy()
-        moved = self._read_motion(np.concatenate([qpos, data.qvel, data.act])[None], self._ctrl[None])
+        here = np.concatenate([data.qpos, data.qvel, data.act])[None]
+        moved = self._read_motion(here, self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
@@ -345,10 +340,8 @@ class MujocoLCS:
             impulse = self._motion.finish(moved, x).response[0]
             response = self.seconds * impulse
             self._yields = self._actuators.yields(self.seconds * response, response)
-        data.qpos[:] = qpos  # which has moved
-        mujoco.mj_fwdPosition(model, data)
         pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        return median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
+        return median_apart(model, data, here[0], response, pairs, 3 if self._finder.axis is None else 2)
 
 
 class _States(NamedTuple):
@@ -411,7 +404,7 @@ class _States(NamedTuple):
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
     """Warn where systems are far off at the ends of the ranges of actions, or half way there."""
-    if step is None or of._whole is None or not of.n_u:
+    if step is None or of._whole is None:
         return
     if of._actuators.curved.size or not of._tried:
         read.doubtful[:_TRIED], of._tried = True, True
@@ -426,7 +419,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)  # far from zero, perhaps
     u = torch.cat([ends, 0.5 * (ends + idle), torch.where(absolute, 0.0, idle)[None]]).clamp(*of.action_bounds(x))
     m, nv = len(u), of.state.nv
-    ctrl = of.control(x.expand(m, *x.shape), u).reshape(-1, of.n_u).numpy()
+    ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
     states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
     after = of._whole.simulate(of._places, states, ctrl)
     free = of._motion.simulate(of._places, states, ctrl, unstable)

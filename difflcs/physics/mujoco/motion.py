@@ -182,8 +182,12 @@ class Dynamic:
         self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
-    def find_secants(self, read: Linearised, places: Places, states: Array, ctrl: Array) -> Linearised:
-        """Add lines nearest to both ends of ranges, for actuators whose force is not linear in `ctrl` (n, nu)."""
+    def find_secants(self, read: Linearised, places: Places, states: Array, x: Array) -> Linearised:
+        """Add lines nearest to both ends of ranges, for actuators whose force is not linear in the control.
+
+        The states are those of MuJoCo and of the system, (n, n_x).
+        """
+        ctrl = read.nominal + x[:, : self.model.nv] @ self.moment.T
         secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
         for k, i in enumerate(self.actuators.curved):
             ends = self.actuators.range[:, i, None] - ctrl[:, i]
