@@ -1,6 +1,7 @@
 """An LCS in the frame of a body: its matrices, its Jacobian, its files, and the method that learns it."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -78,6 +79,7 @@ def test_the_warmup_alone_will_do(tmp_path):
     config = TrainConfig(task="cube", method=FrameMethod().smoke(), minutes=0.2, final_goals=3)
     run = train(config, tmp_path / "run")
     assert not any(row["kl"] for row in run.rows())
-    assert isinstance(load_policy(run).lcs, BodyFrameLCS)
+    policy: Any = load_policy(run)
+    assert isinstance(policy.lcs, BodyFrameLCS)
     with pytest.raises(InvalidInputError, match="a planar task for frame-lcs, got turn_cube"):
         train(replace(config, task="turn_cube"), tmp_path / "other")
