@@ -129,11 +129,8 @@ class MPCSolver(Solver):
         """Solve the problem as it is and return the outputs of `solve` on a device."""
         problem, constant = self.problem, self.constant
         violation = torch.from_numpy(np.zeros(problem.batch))  # before the solve, and by NumPy, as it is faster
-        backend, limit = self.backend, getattr(self.backend, "time_limit", None)
-        if limit is not None:
-            left = limit - (time.perf_counter() - self.began) - _AFTERWARDS
-            backend = replace(backend, time_limit=max(left, 1e-9))  # pyright: ignore
-        result = backend.solve(problem, start)
+        needed = time.perf_counter() - self.began + _AFTERWARDS
+        result = self.backend.after(needed).solve(problem, start)
         if problem.n_c:
             violation = problem.violation(result.primal.x, result.primal.u)
             # The numbers of a failed element can be so large that their products overflow.

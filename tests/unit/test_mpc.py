@@ -246,6 +246,15 @@ def recording(build, **options):
     return LCSMPCLayer(**options, backend=backend), backend
 
 
+def test_a_backend_may_have_a_time_limit_that_is_no_option_of_it(build, x0):
+    class Limited(Recorder):
+        time_limit = 5.0
+
+    backend = Limited()
+    LCSMPCLayer(build.params(3), build.cost(3), 3, backend=backend)(x0)
+    assert len(backend.seen) == 1
+
+
 @pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])
 def test_what_a_call_is_given_replaces_the_layers_own(build, x0, name):
     n = build.normal(7)

@@ -78,6 +78,10 @@ class Backend(ABC):
             InvalidInputError: what it cannot do, and which backend can.
         """
 
+    def after(self, seconds: float) -> "Backend":
+        """Return the backend for a call of a layer that needs some seconds besides; one with a time limit has less."""
+        return self
+
     @abstractmethod
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve a batch; see `certify` for turning raw trajectories into a `Result`."""

@@ -108,6 +108,11 @@ class BatchedBackend(Backend):
         if check_number("shrink", self.shrink, strict=True) >= 1:
             check_number("1 - shrink", 1 - self.shrink, strict=True)
 
+    def after(self, seconds: float) -> "BatchedBackend":
+        """See `Backend`."""
+        limit = self.time_limit
+        return self if limit is None else replace(self, time_limit=max(limit - seconds, 1e-9))
+
     def solve(self, problem: MPCProblem, guess: Primal | None) -> BatchedResult:
         """Solve every element from one start or several."""
         started = time.perf_counter()

@@ -130,6 +130,7 @@ def fit(
     module, body = check_module(lcs), lcs if isinstance(lcs, BodyFrameLCS) else None
     if body is not None:
         (x, u, x_next), context = body.take_units(x, u, x_next), None
+    system = (lambda: lcs) if body is None else body.at_rest
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
     n_train = max(1, int((1 - HELD_OUT) * len(x)))
@@ -145,8 +146,7 @@ def fit(
         parts = [v[shuffled].split(size) for v in (x, u, x_next)]
         context_batches = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
         for x_batch, u_batch, next_batch, context_batch in zip(*parts, context_batches, strict=True):
-            system = lcs if body is None else body.at_rest()
-            loss = violation_loss(system, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
+            loss = violation_loss(system(), x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
             check_depends(loss)
             adam.zero_grad()
             loss.backward()
@@ -157,8 +157,7 @@ def fit(
     with torch.no_grad():
         held_out = (x[rest], u[rest], x_next[rest], gamma, xi)
         rest_context = None if context is None else context[rest]
-        system = lcs if body is None else body.at_rest()
-        left_out = violation_loss(system, *held_out, context=rest_context) if len(rest) else None
+        left_out = violation_loss(system(), *held_out, context=rest_context) if len(rest) else None
     return Fit(float(torch.stack(recent).mean()), None if left_out is None else float(left_out), steps)
 
 
