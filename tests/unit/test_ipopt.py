@@ -161,16 +161,6 @@ def test_workers_do_not_run_the_users_script_again_and_end_with_it():
 # --- options --------------------------------------------------------------------------------------------------------
 
 
-def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
-    plain, ahead = (make_layer(build, backend=IpoptBackend(contact=c, workers=1)) for c in ("equation", "inequality"))
-    one, other = plain(x0), ahead(x0)
-    assert bool(other.converged.all())
-    assert float(other.kkt_residual.max()) <= 1e-6
-    assert float(other.complementarity().max()) <= 1e-9
-    assert float((other.objective - one.objective).abs().max()) < 1e-3
-    assert int(other.iterations.sum()) > int(one.iterations.sum())
-
-
 def test_the_better_of_two_starts_is_kept():
     costs = []
     for options in ({}, {"second_start": None}, {"second_start": None, "start": 1.0, "mu_init": 0.1}):
@@ -190,8 +180,6 @@ def test_the_better_of_two_starts_is_kept():
         ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
         ({"second_start": 0.0}, InvalidInputError, "second_start: .*got 0"),
         ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
-        ({"mu_strategy": "fast"}, InvalidInputError, "mu_strategy: expected one of 'adaptive', 'monotone', got 'fast'"),
-        ({"contact": "hard"}, InvalidInputError, "contact: expected one of 'equation', 'inequality', got 'hard'"),
     ],
 )
 def test_options_are_checked(options, error, message):

@@ -44,8 +44,6 @@ class Options(NamedTuple):
 
     Attributes:
         tol, max_iter, mu_init: options of IPOPT.
-        adaptive: whether IPOPT chooses its barrier parameter anew in each iteration.
-        inequality: whether the contact is λ·s ≤ ε, not =.
         barrier: whether the cost has a barrier of the action bounds.
         slack: whether a constraint may be violated, by a variable v ≥ 0 at its price.
         elastic: whether Σ v² / 2 is the whole cost.
@@ -54,8 +52,6 @@ class Options(NamedTuple):
     tol: float
     max_iter: int
     mu_init: float
-    adaptive: bool
-    inequality: bool
     barrier: bool
     slack: bool
     elastic: bool
@@ -131,7 +127,6 @@ def _solver(sizes: Sizes, options: Options) -> casadi.Function:
         "ipopt.tol": options.tol,
         "ipopt.max_iter": options.max_iter,
         "ipopt.mu_init": options.mu_init,
-        "ipopt.mu_strategy": "adaptive" if options.adaptive else "monotone",
         "ipopt.bound_relax_factor": 0.0,
         # Another order of the pivots is 10 % faster. Steps without a check of their residual would be, too, and blur
         # which constraints act. Compiled functions (CasADi's JIT) would save 3 to 15 % and take 10 to 50 s to compile.
@@ -222,8 +217,7 @@ def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[
     ends = np.cumsum([n_u, n_lam, n_lam, n_x])
     equations = horizon * (n_x + 2 * n_lam)
     rows = (horizon + 1) * n_c
-    stage = np.concatenate([np.zeros(n_x + n_lam), np.full(n_lam, -np.inf if options.inequality else 0.0)])
-    least = np.concatenate([np.tile(stage, horizon), np.full(rows, -np.inf)])
+    least = np.concatenate([np.zeros(equations), np.full(rows, -np.inf)])
     free, positive = np.full((horizon, n_x), np.inf), np.zeros((horizon, 2 * n_lam))
     result = Solved.start(chunk)
 

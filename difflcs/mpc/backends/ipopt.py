@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_threads, make_plain
+from difflcs._checks import check_number, check_positive_int, check_threads, make_plain
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
@@ -60,10 +60,6 @@ class IpoptBackend(Backend):
             None: one start, in half the time; its plans on pushing models cost up to 1 % more than those of λ = s = 1.
         mu_init: IPOPT's first barrier parameter at a cold start.
         mu_init_warm: the same with a guess.
-        mu_strategy: IPOPT's: "monotone", or "adaptive": another way, whose optima are not better or worse in general;
-            up to three times slower on the cart-pole and chains of carts.
-        contact: "equation", or "inequality": a cold start solves λ·s ≤ ε first, which has other optima,
-            and the equation from there. That takes up to twice the time; on an unstable system it may end worse.
     """
 
     name: ClassVar[str] = "ipopt"
@@ -78,8 +74,6 @@ class IpoptBackend(Backend):
     second_start: float | None = 1.0
     mu_init: float = 1e-4
     mu_init_warm: float = 1e-6
-    mu_strategy: str = "monotone"
-    contact: str = "equation"
 
     def __post_init__(self) -> None:
         make_plain(self)
@@ -89,8 +83,6 @@ class IpoptBackend(Backend):
             check_number(name, getattr(self, name), strict=True)
         if self.second_start is not None:
             check_number("second_start", self.second_start, strict=True)
-        check_choice("mu_strategy", self.mu_strategy, ("adaptive", "monotone"))
-        check_choice("contact", self.contact, ("equation", "inequality"))
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
@@ -111,8 +103,7 @@ class IpoptBackend(Backend):
 
     def _cold(self, problem: MPCProblem) -> _Run:
         """Solve from both starts; keep the better plan, and the sum of iterations and seconds."""
-        inequality = self.contact == "inequality" and problem.n_lam > 0
-        run = self._by_inequality(problem) if inequality else self._run(problem, None, warm=False)
+        run = self._run(problem, None, warm=False)
         if self.second_start is None or problem.n_lam == 0:
             return run
         other = replace(self, start=self.second_start, mu_init=_MU_INIT)._run(problem, None, warm=False)
@@ -125,24 +116,7 @@ class IpoptBackend(Backend):
         run.iterations, run.seconds = spent
         return run
 
-    def _by_inequality(self, problem: MPCProblem) -> _Run:
-        """Solve with λ·s ≤ ε, then with the equation from those actions; cold if that fails."""
-        ahead = self._run(problem, None, warm=False, inequality=True)
-        u = torch.nan_to_num(ahead.u, posinf=0.0, neginf=0.0)
-        run = self._run(problem, Primal(ahead.x, u, ahead.lam, ahead.mu), warm=True)
-        run.iterations += ahead.iterations
-        run.seconds += ahead.seconds
-        failed = torch.nonzero(run.status != Status.CONVERGED).squeeze(-1)
-        if len(failed):
-            again = self._run(problem.select(failed), None, warm=False)
-            again.iterations += run.iterations[failed]
-            again.seconds += run.seconds[failed]
-            run.replace(failed, again)
-        return run
-
-    def _run(
-        self, problem: MPCProblem, guess: Primal | None, warm: bool, elastic: bool = False, inequality: bool = False
-    ) -> _Run:
+    def _run(self, problem: MPCProblem, guess: Primal | None, warm: bool, elastic: bool = False) -> _Run:
         """Run IPOPT once per element."""
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
@@ -150,8 +124,7 @@ class IpoptBackend(Backend):
         sizes = Sizes(P.n_x, P.n_u, P.n_lam, P.n_c, P.horizon, parameters(P))
         slack = P.n_c > 0 and (elastic or bool(torch.isfinite(P.price).any()))
         mu_init = self.mu_init_warm if warm else self.mu_init
-        adaptive = self.mu_strategy == "adaptive" and not warm
-        options = Options(self.tol, self.max_iter, mu_init, adaptive, inequality, P.barrier > 0, slack, elastic)
+        options = Options(self.tol, self.max_iter, mu_init, P.barrier > 0, slack, elastic)
         chunk = self._start(problem, guess, elastic)
         workers = min(self.workers or _cpus(), problem.batch)
         if workers <= 1:
