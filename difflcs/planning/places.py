@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor, make_plain
+from difflcs._checks import check_number, check_tensor, make_plain
 from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
@@ -37,13 +37,12 @@ class Places(Protocol):
 
 @dataclass(frozen=True)
 class Workspace:
-    """A rectangle that the targets of discs may not leave, and how far one may be sent in a step.
+    """A rectangle that the targets of a disc may not leave, and how far it may be sent in a step.
 
     Attributes:
         low: (x, y) of its lower corner [length].
         high: (x, y) of its upper corner.
         step: largest |u| of each component [length], > 0.
-        n_discs: number of discs, whose places are x[3 : 3 + 2 · n_discs] as in `difflcs.physics.PlanarPushing`.
 
     Raises:
         InvalidInputError and its kinds: a value does not fit.
@@ -52,12 +51,10 @@ class Workspace:
     low: Sequence[float]
     high: Sequence[float]
     step: float
-    n_discs: int = 1
 
     def __post_init__(self) -> None:
         make_plain(self)
         check_number("step", self.step, strict=True)
-        check_positive_int("n_discs", self.n_discs)
         for name in ("low", "high"):
             if len(getattr(self, name)) != 2:
                 raise ShapeError(f"{name}: expected x and y, got {len(getattr(self, name))} numbers; give a corner")
@@ -67,12 +64,12 @@ class Workspace:
             )
 
     def bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return u_min and u_max (..., 2 · n_discs) of relative actions at states (..., n_x).
+        """Return u_min and u_max (..., 2) of relative actions at states (..., n_x) of `difflcs.physics.PlanarPushing`.
 
         A disc that is outside is sent no further out.
         """
-        discs = states[..., 3 : 3 + 2 * self.n_discs]
-        low, high = (discs.new_tensor(corner).repeat(self.n_discs) - discs for corner in (self.low, self.high))
+        disc = states[..., 3:5]
+        low, high = (disc.new_tensor(corner) - disc for corner in (self.low, self.high))
         return low.clamp(-self.step, 0.0), high.clamp(0.0, self.step)
 
     def clamp(self, points: Tensor) -> Tensor:
@@ -96,18 +93,15 @@ def _rotation(x: Tensor) -> Tensor:
 
 
 class DiscPlaces:
-    """Discs round a body on a plane, as in `difflcs.physics.PlanarPushing`: on a ring round its shape.
-
-    Each disc in turn goes to each place of the ring while the others stay. Places where discs overlap are not allowed.
+    """A disc round a body on a plane, as in `difflcs.physics.PlanarPushing`: on a ring round its shape.
 
     Args:
         shape: outline of the body in its own coordinates.
-        radius: of the discs [length], > 0.
+        radius: of the disc [length], > 0.
         n_places: on the ring, at equal distances along it.
-        gap: between a disc on the ring and the body [length]; None: a tenth of the radius.
+        gap: between the disc on the ring and the body [length]; None: a tenth of the radius.
         reach: largest gap between disc and body at which pushing is considered [length]; None: the radius.
-        n_discs: number of discs.
-        workspace: region for discs on places; None: everywhere.
+        workspace: region for places; None: everywhere.
         margin: between a place and the border of the workspace [length].
 
     Raises:
@@ -122,54 +116,34 @@ class DiscPlaces:
         *,
         gap: float | None = None,
         reach: float | None = None,
-        n_discs: int = 1,
         workspace: Workspace | None = None,
         margin: float = 0.0,
     ):
         self.shape = shape
         self.radius = check_number("radius", radius, strict=True)
-        self.n_discs = check_positive_int("n_discs", n_discs)
         self.reach = radius if reach is None else check_number("reach", reach)
         self.workspace, self.margin = workspace, check_number("margin", margin)
         gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
         self.ring = ring(shape, radius + gap, n_places)
 
     def sample(self, x: Tensor) -> Tensor:
-        """See `Places`: (n, 2 · n_discs) in coordinates of the body."""
-        if self.n_discs == 1:
-            return self.ring
-        here = to_body(x, self._discs(x))
-        each, n = len(self.ring), self.n_discs
-        alone = here.expand(n, each, n, 2).clone()
-        disc = torch.arange(n)
-        alone[disc, :, disc] = self.ring
-        return alone.reshape(n * each, 2 * n)
+        """See `Places`: (n_places, 2) in coordinates of the body."""
+        return self.ring
 
     def states(self, x: Tensor, places: Tensor) -> Tensor:
         """See `Places`."""
-        check_tensor("places", places, [("2 n_discs", 2 * self.n_discs)])
+        check_tensor("places", places, [("2", 2)])
         states = x.expand(len(places), -1).clone()
-        end = 3 + 2 * self.n_discs
-        states[:, 3:end] = from_body(x, places.reshape(-1, 2)).reshape(len(places), end - 3)
-        # The places may be followed by velocities of discs and body: both are at rest by then.
-        states[:, end:] = 0.0
+        states[:, 3:5] = from_body(x, places)
+        states[:, 5:] = 0.0  # velocities of disc and body, if the state has any: both are at rest by then
         return states
 
     def allowed(self, states: Tensor) -> Tensor:
         """See `Places`."""
-        discs = states[:, 3 : 3 + 2 * self.n_discs].reshape(len(states), self.n_discs, 2)
-        allowed = torch.ones(len(states), dtype=torch.bool)
-        if self.workspace is not None:
-            allowed &= self.workspace.contains(discs, self.margin).all(-1)
-        if self.n_discs > 1:
-            i, j = torch.triu_indices(self.n_discs, self.n_discs, offset=1)
-            allowed &= ((discs[:, i] - discs[:, j]).norm(dim=-1) > 2 * self.radius).all(-1)
-        return allowed
+        if self.workspace is None:
+            return torch.ones(len(states), dtype=torch.bool)
+        return self.workspace.contains(states[:, 3:5], self.margin)
 
     def near(self, x: Tensor) -> bool:
         """See `Places`."""
-        gap = clearance(self.shape, to_body(x, self._discs(x))) - self.radius
-        return bool((gap < self.reach).any())
-
-    def _discs(self, x: Tensor) -> Tensor:
-        return x[3 : 3 + 2 * self.n_discs].reshape(self.n_discs, 2)
+        return bool(clearance(self.shape, to_body(x, x[None, 3:5])) - self.radius < self.reach)

@@ -6,7 +6,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import check_number
 from difflcs.physics.planar import Drive, PositionDrive, to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import DistanceGrid, ring
@@ -35,24 +35,22 @@ class Travel(Protocol):
 
 
 class PlanarTravel:
-    """Travel of discs on a plane round the shape of the body, as fast as their drive allows.
+    """Travel of a disc on a plane round the shape of the body, as fast as its drive allows.
 
     The path is the shortest one of straight lines between waypoints on a curve round the body, inside the workspace if
-    there is one. A drive is linear: the action that takes a disc to a given point in one step is known, and so is its
-    course. Of many points on the path, for the end of this step and of the next, a disc is sent to those that bring it
-    farthest without touching the body. Actions are relative, as in `difflcs.physics.PlanarPushing`. Discs ignore each
-    other.
+    there is one. A drive is linear: the action that takes the disc to a given point in one step is known, and so is its
+    course. Of many points on the path, for the end of this step and of the next, it is sent to those that bring it
+    farthest without touching the body. Actions are relative, as in `difflcs.physics.PlanarPushing`.
 
     Args:
         shape: outline of the body in its own coordinates.
-        radius: of the discs [length], > 0.
-        step: largest norm of the action of a disc, > 0.
-        drive: of the discs; None: `PositionDrive()`, they go where they are sent.
+        radius: of the disc [length], > 0.
+        step: largest norm of its action, > 0.
+        drive: of the disc; None: `PositionDrive()`, it goes where it is sent.
         clearance: between disc and body at waypoints [length]; None: half the radius. On the way it is at least .3 of
             it, or as much as at its ends.
-        tolerance: distance to the target at which a disc has arrived [length]; None: half the radius.
-        n_discs: number of discs; x[3 : 3 + 2 · n_discs] are their places, and their velocities follow if they have any.
-        workspace: region in which the way should stay and which no disc is sent out of; None: everywhere.
+        tolerance: distance to the target at which the disc has arrived [length]; None: half the radius.
+        workspace: region in which the way should stay and which the disc is not sent out of; None: everywhere.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -67,7 +65,6 @@ class PlanarTravel:
         drive: Drive | None = None,
         clearance: float | None = None,
         tolerance: float | None = None,
-        n_discs: int = 1,
         workspace: Workspace | None = None,
     ):
         self.shape = shape
@@ -75,76 +72,70 @@ class PlanarTravel:
         self.step = check_number("step", step, strict=True)
         self.clearance = 0.5 * radius if clearance is None else check_number("clearance", clearance, strict=True)
         self.tolerance = 0.5 * radius if tolerance is None else check_number("tolerance", tolerance, strict=True)
-        self.n_discs = check_positive_int("n_discs", n_discs)
         self.workspace = workspace
         with torch.no_grad():
             course = (PositionDrive() if drive is None else drive).course()
-            self._A = _by_disc(course.A, n_discs, 2)
-            self._b = _by_disc(course.b, n_discs, 1)
+            instants, order = len(course.b), course.b.shape[-1]
+            self._A = course.A.reshape(instants, -1, order, order).expand(-1, 2, -1, -1)  # by coordinate
+            self._b = course.b.reshape(instants, -1, order).expand(-1, 2, -1)
             self._grid = DistanceGrid(shape, 2 * (radius + self.clearance))
             self.ring = ring(shape, radius + self.clearance, _WAYPOINTS)
             seen = torch.stack([self._in_sight(point, self.ring) for point in self.ring])
             self._between = torch.where(seen & seen.mT, torch.cdist(self.ring, self.ring), math.inf)
 
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
-        """See `Travel`: the straight distance of the disc that has farthest to go."""
-        return (self._discs(states) - self._discs(x)).norm(dim=-1).amax(-1)
+        """See `Travel`: the straight distance."""
+        return (states[:, 3:5] - x[3:5]).norm(dim=-1)
 
     def action(self, x: Tensor, target: Tensor) -> Tensor:
         """See `Travel`."""
-        there = self._discs(target)
         with torch.no_grad():
-            return torch.cat([self._send(x, there[i], i) for i in range(self.n_discs)])
+            return self._send(x, target[3:5])
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:
         """See `Travel`."""
-        return bool((self._discs(target) - self._discs(x)).norm(dim=-1).max() < self.tolerance)
+        return bool((target[3:5] - x[3:5]).norm() < self.tolerance)
 
-    def _discs(self, x: Tensor) -> Tensor:
-        return x[..., 3 : 3 + 2 * self.n_discs].reshape(*x.shape[:-1], self.n_discs, 2)
-
-    def _send(self, x: Tensor, there: Tensor, disc: int) -> Tensor:
-        """Choose the action (2,) of a disc that is to go there (2,)."""
+    def _send(self, x: Tensor, there: Tensor) -> Tensor:
+        """Choose the action (2,) of the disc that is to go there (2,)."""
         order = self._b.shape[-1]
-        motion = x[3 : 3 + 2 * self.n_discs * order].reshape(order, self.n_discs, 2)[:, disc]
+        motion = x[3 : 3 + 2 * order].reshape(order, 2)
         ends = to_body(x, torch.stack([motion[0], there]))
         way = from_body(x, self._way(x, ends[0], ends[1]))
         least = self._gap(ends).amin().clamp(max=_LEAST * self.clearance)
-        reach = float(self._b[-1, disc, :, 0].max()) * self.step
+        reach = float(self._b[-1, :, 0].max()) * self.step
 
         def touch(course: Tensor) -> Tensor:
             gap = self._gap(to_body(x, course[..., 0, :].reshape(-1, 2))).reshape(course.shape[:-2])
             return (least - gap.amin(-1)).clamp_min(0.0)
 
         at, goals = _along(way, reach, _POINTS)
-        sent, first = self._course(motion, goals, disc)
+        sent, first = self._course(motion, goals)
         arrives = (first[:, -1, 0] - there).norm(dim=-1) < 0.6 * self.tolerance
         come, goals = _along(way, 2 * reach, _POINTS + 4)
-        second = self._course(first[:, None, -1], goals, disc)[1]
+        second = self._course(first[:, None, -1], goals)[1]
         missed = (second[..., -1, 0, :] - goals).norm(dim=-1)
         speed = second[..., -1, 1:, :].norm(dim=-1).sum(-1)
         score = come - 2 * missed - _SPEED * speed - _TOUCH * (touch(first)[:, None] + touch(second))
         score += 0.01 * at[:, None] + 10 * reach * arrives[:, None]
         return sent[int(score.amax(1).argmax())]
 
-    def _course(self, motion: Tensor, goals: Tensor, disc: int) -> tuple[Tensor, Tensor]:
-        """Compute the actions by which a disc ends a step at some points, or as near as it may be sent.
+    def _course(self, motion: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the actions by which the disc ends a step at some points, or as near as it may be sent.
 
         Args:
             motion: (..., order, 2) its place, and its velocity if it has one.
             goals: (..., 2) the points.
-            disc: its number.
 
         Returns:
             Actions (..., 2), and courses (..., n_instants, order, 2).
         """
-        A, b = self._A[:, disc], self._b[:, disc]
-        drift = torch.einsum("tcjl,...lc->...tjc", A, motion)
-        u = (goals - drift[..., -1, 0, :]) / b[-1, :, 0]
+        drift = torch.einsum("tcjl,...lc->...tjc", self._A, motion)
+        u = (goals - drift[..., -1, 0, :]) / self._b[-1, :, 0]
         u = u * (self.step / u.norm(dim=-1, keepdim=True).clamp_min(self.step))
         if self.workspace is not None:
             u = self.workspace.clamp(motion[..., 0, :] + u) - motion[..., 0, :]
-        return u, drift + torch.einsum("tcj,...c->...tjc", b, u)
+        return u, drift + torch.einsum("tcj,...c->...tjc", self._b, u)
 
     def _way(self, x: Tensor, start: Tensor, end: Tensor) -> Tensor:
         """Find the shortest way (n, 2) from start to end by waypoints, in coordinates of the body."""
@@ -186,12 +177,6 @@ class PlanarTravel:
         gap = self._gap(start + t * (ends - start).unsqueeze(-2))
         nearest = torch.minimum(gap[:, :1], gap[:, -1:]).clamp(max=_LEAST * self.clearance)
         return (gap >= nearest - 1e-9).all(-1)
-
-
-def _by_disc(values: Tensor, n_discs: int, tail: int) -> Tensor:
-    """Expand values (n_instants, …, k[, k]), with a tail of 1 or 2, to (n_instants, n_discs, 2, k[, k])."""
-    lead, last = values.shape[1 : values.ndim - tail], values.shape[values.ndim - tail :]
-    return values.reshape(-1, *[1] * (2 - len(lead)), *lead, *last).expand(-1, n_discs, 2, *last)
 
 
 def _along(way: Tensor, longest: float, points: int) -> tuple[Tensor, Tensor]:

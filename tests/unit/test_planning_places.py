@@ -100,19 +100,6 @@ def test_places_outside_the_workspace_are_not_allowed():
     assert 5 < int(places.allowed(states).sum()) < 35
 
 
-def test_of_several_discs_each_moves_alone():
-    places = DiscPlaces(box(-0.5, 0.5, -0.5, 0.5), 0.1, 16, n_discs=2)
-    x = tensor([0.2, 0.1, 0.4, 1.5, 0.0, -1.5, 0.0])
-    states = places.states(x, places.sample(x))
-    assert len(states) == 32
-    alone = DiscPlaces(box(-0.5, 0.5, -0.5, 0.5), 0.1, 16)
-    torch.testing.assert_close(states[:16, 3:5], alone.states(x[:5], alone.sample(x[:5]))[:, 3:5])
-    torch.testing.assert_close(states[:16, 5:7], x[5:7].expand(16, 2))
-    torch.testing.assert_close(states[16:, 3:5], x[3:5].expand(16, 2))
-    apart = (states[:, 3:5] - states[:, 5:7]).norm(dim=1)
-    torch.testing.assert_close(places.allowed(states), apart > 0.2)
-
-
 def test_bounds_of_the_workspace_hold_targets_inside():
     workspace = Workspace((0.0, 0.0), (1.0, 2.0), step=0.3)
     low, high = workspace.bounds(tensor([[0, 0, 0, 0.1, 1.0], [0, 0, 0, 0.9, 1.9], [0, 0, 0, 1.2, -0.1]]))
