@@ -21,6 +21,7 @@ from difflcs import (
     LinearConstraints,
     StageBounds,
     Transitions,
+    _storage,
     fit_report,
     prediction_loss,
     solve_lcp,
@@ -281,8 +282,8 @@ def test_what_a_training_keeps_can_be_read(tmp_path):
     LCSModel.from_config(state["settings"], state["plain"], "checkpoint")
     network = mlp.MLPController(lambda *_: X, 4, -torch.ones(2), torch.ones(2), 8, 10)
     parametrizations.weight_norm(network.layers[0])
-    network.save_pretrained(tmp_path)
-    again = mlp.MLPController.from_pretrained(tmp_path, lambda *_: X)
+    trainer.save_learned(network, tmp_path, "network")
+    again = mlp.MLPController.from_config(*_storage.load_record(tmp_path, "network"), "network", lambda *_: X)
     torch.testing.assert_close(again.mean(X, GOAL, X[:, 0]), network.mean(X, GOAL, X[:, 0]))
     ensemble = dynamics.Ensemble(4, 2, 2, 8)
     prune.l1_unstructured(ensemble.weights, "0", 3)

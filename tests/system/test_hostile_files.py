@@ -16,6 +16,7 @@ from difflcs.errors import CheckpointError
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.state import check_state
+from difflcs.rl.learning.trainer import save_learned
 from difflcs.rl.methods import method_names
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.runs.trained import TrainedPolicy
@@ -53,10 +54,15 @@ def write(path, content):
 CHECKPOINT = {"n": 1, "inner": dict(small_model().state_dict())}
 RECORDS = {
     "model": (lambda path: small_model().save_pretrained(path), LCSModel.from_pretrained),
-    "ensemble": (lambda path: Ensemble(2, 1, 2, 4).save_pretrained(path), Ensemble.from_pretrained),
+    "ensemble": (
+        lambda path: save_learned(Ensemble(2, 1, 2, 4), path),
+        lambda path: Ensemble.from_config(*_storage.load_record(path, "Ensemble"), str(path)),
+    ),
     "network": (
-        lambda path: MLPController(pushing_features, 15, -torch.ones(6), torch.ones(6), 4).save_pretrained(path),
-        lambda path: MLPController.from_pretrained(path, pushing_features),
+        lambda path: save_learned(MLPController(pushing_features, 15, -torch.ones(6), torch.ones(6), 4), path),
+        lambda path: MLPController.from_config(
+            *_storage.load_record(path, "MLPController"), str(path), pushing_features
+        ),
     ),
     "checkpoint": (
         lambda path: save_checkpoint(path.parent, 1, CHECKPOINT),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,12 +13,11 @@ from torch import Tensor, nn
 
 from difflcs import _storage
 from difflcs._checks import check_positive_int
-from difflcs._modules import plain_state, untouched
+from difflcs._modules import untouched
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.learning.least_squares import gradients
 from difflcs.rl.settings import MOST_NETWORKS, MOST_WIDTH, Epochs, Settings, bounded, group
 
-_KIND = "dynamics"
 _SIZES = ("n_x", "n_u", "networks", "width")
 _VECTOR = 16
 """Numbers of single precision in the widest vectors of a CPU: products of such sizes are the fastest."""
@@ -201,20 +199,6 @@ class Ensemble(nn.Module):
     def config(self) -> dict[str, Any]:
         """Return the sizes of the ensemble."""
         return {name: getattr(self, name) for name in _SIZES}
-
-    def save_pretrained(self, directory: Path) -> None:
-        """Write the ensemble into a directory, atomically."""
-        _storage.save_record(Path(directory), _KIND, self.config(), plain_state(self))
-
-    @classmethod
-    def from_pretrained(cls, directory: Path) -> Ensemble:
-        """Read what `save_pretrained` wrote.
-
-        Raises:
-            CheckpointError: files are missing, corrupt or of another kind.
-        """
-        config, tensors = _storage.load_record(Path(directory), _KIND)
-        return cls.from_config(config, tensors, str(directory))
 
     @classmethod
     def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Ensemble:

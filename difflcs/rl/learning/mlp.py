@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,12 +12,10 @@ from torch import Tensor, nn
 
 from difflcs import _storage
 from difflcs._checks import check_positive_int
-from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.rollout import PolicyOutput, elapsed_fractions
 from difflcs.rl.tasks import Features, compute_features
 
-_KIND = "MLP"
 _SIZES = ("n_features", "width", "episode_steps")
 
 
@@ -108,20 +105,6 @@ class MLPController(nn.Module):
     def config(self) -> dict[str, Any]:
         """Return the sizes of the network."""
         return {name: getattr(self, name) for name in _SIZES}
-
-    def save_pretrained(self, directory: Path) -> None:
-        """Write the network into a directory, atomically. Its features are not: they are code."""
-        _storage.save_record(Path(directory), _KIND, self.config(), plain_state(self))
-
-    @classmethod
-    def from_pretrained(cls, directory: Path, features: Features) -> MLPController:
-        """Read what `save_pretrained` wrote.
-
-        Raises:
-            CheckpointError: files are missing, corrupt or of another kind.
-        """
-        config, tensors = _storage.load_record(Path(directory), _KIND)
-        return cls.from_config(config, tensors, str(directory), features)
 
     @classmethod
     def from_config(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from difflcs import _storage
 from difflcs._checks import check_positive_int
@@ -154,4 +154,5 @@ def save_learned(learned: TrainableModel, directory: Path, kind: str | None = No
     if callable(save):
         save(directory)
     else:
-        _storage.save_record(directory, kind or type(learned).__name__, configuration(learned), learned.state_dict())
+        tensors = plain_state(learned) if isinstance(learned, nn.Module) else learned.state_dict()
+        _storage.save_record(directory, kind or type(learned).__name__, configuration(learned), tensors)
