@@ -81,12 +81,7 @@ def cart_pole_between_walls(
     force_effect = _matrix([[1 / M], [-1 / (M * L)]])
     wall_effect = _matrix([[0, 0], [-1 / (m * L), 1 / (m * L)]])
     eye = torch.eye(2, dtype=torch.float64)
-    A = torch.cat(
-        [
-            torch.cat([eye + h * h * gravity_effect, h * eye], 1),
-            torch.cat([h * gravity_effect, eye], 1),
-        ]
-    )
+    A = torch.cat([torch.cat([eye + h * h * gravity_effect, h * eye], 1), torch.cat([h * gravity_effect, eye], 1)])
     B, C = (torch.cat([h * h * effect, h * effect]) for effect in (force_effect, wall_effect))
     gaps = _matrix([[-1, -L, 0, 0], [1, L, 0, 0]])
     return LCSParams(

@@ -91,11 +91,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     used = [cell for cells in shown.values() for cell in cells.values()]
     said = [line for task, cells in shown.items() for line in words(cells, task)]
     report.write_tables(
-        folder,
-        name,
-        tables,
-        [NOTE, *report.bullets(said), *report.provenance(used)],
-        {name: "What each part is worth"},
+        folder, name, tables, [NOTE, *report.bullets(said), *report.provenance(used)], {name: "What each part is worth"}
     )
     return True
 

@@ -347,12 +347,7 @@ class Direction(NamedTuple):
 
 
 def solve(
-    problem: MPCProblem,
-    lin: Linearisation,
-    x_bar: Tensor,
-    u_bar: Tensor,
-    lam_bar: Tensor,
-    target: Tensor | None = None,
+    problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor, lam_bar: Tensor, target: Tensor | None = None
 ) -> Direction:
     """Solve K_z w = z̄ for upstream gradients on x, u and λ.
 
@@ -374,13 +369,7 @@ def solve(
     least = torch.full((problem.batch,), torch.inf, dtype=torch.float64)
     for _ in range(_PASSES):
         force, before = mu - lin.weight * target, mu
-        direction = _solve(
-            problem,
-            lin,
-            x_bar - matvec(G_x.mT, force),
-            u_bar - matvec(G_u.mT, force[:, :-1]),
-            lam_bar,
-        )
+        direction = _solve(problem, lin, x_bar - matvec(G_x.mT, force), u_bar - matvec(G_u.mT, force[:, :-1]), lam_bar)
         along = lin.weight * _along(problem, lin, direction)
         # The multiplier of this direction; ν lacks the part in the augmented Hessian.
         mu = force + along

@@ -12,16 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs import (
-    GoalCost,
-    LCSMPCLayer,
-    LCSParams,
-    LCSSequence,
-    QuadraticCost,
-    SolveError,
-    StageBounds,
-    Status,
-)
+from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost, SolveError, StageBounds, Status
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.mpc import MPCController
 from difflcs.mpc.backends import BatchedBackend

@@ -16,11 +16,7 @@ import trimesh
 
 from difflcs_envs import MeshError
 from difflcs_envs.trifinger import meshes
-from difflcs_envs.trifinger.env import (
-    TriFingerMoveCubeEnv,
-    TriFingerMoveObjectEnv,
-    TriFingerTurnCubeEnv,
-)
+from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
 from difflcs_envs.trifinger.model import FINGER_YAWS
 from difflcs_envs.trifinger.section import cross_section
 from difflcs_envs.ycb import YCB

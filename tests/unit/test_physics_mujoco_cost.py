@@ -7,16 +7,7 @@ import torch
 
 from difflcs import CostModule, LCSMPCLayer
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
-from difflcs.physics.mujoco import (
-    Distance,
-    Effort,
-    MujocoCost,
-    MujocoLCS,
-    Orientation,
-    Position,
-    Posture,
-    Velocity,
-)
+from difflcs.physics.mujoco import Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position, Posture, Velocity
 
 MODEL = """
 <mujoco><option gravity="0 0 0"/><worldbody>

@@ -10,13 +10,7 @@ where h > 0 is the depth of the tip below the mount within that plane.
 
 import numpy as np
 
-from difflcs_envs.trifinger.model import (
-    FINGER_YAWS,
-    JOINT_RANGES,
-    LINK_LENGTH,
-    MOUNT_HEIGHT,
-    MOUNT_RADIUS,
-)
+from difflcs_envs.trifinger.model import FINGER_YAWS, JOINT_RANGES, LINK_LENGTH, MOUNT_HEIGHT, MOUNT_RADIUS
 
 # Rows: the axes of each finger frame in the world, (3 fingers, 3 axes, 3).
 FINGER_AXES = np.array([[[np.cos(a), np.sin(a), 0.0], [-np.sin(a), np.cos(a), 0.0], [0, 0, 1]] for a in FINGER_YAWS])
