@@ -120,6 +120,21 @@ def test_friction_holds_against_another_action_than_the_nominal_one(force):
     assert float((after - module.state.to_state(data.qpos, data.qvel))[1].abs()) < 0.03
 
 
+def test_an_action_against_an_equality_constraint_that_is_far_from_held_does_what_it_does_in_mujoco():
+    arm = BAR.format("a", 0, LINK + '<site name="tip" pos="0 0 .3"/>') + '<site name="far" pos=".4 0 1.2"/>'
+    model = load(arm, '<actuator><motor joint="a"/><motor joint="b"/></actuator>'
+                 '<equality><connect site1="far" site2="tip"/></equality>')  # fmt: skip
+    module = MujocoLCS(model, motion="dynamic", seconds=0.05)
+    after = []
+    for ctrl in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]):
+        data = mujoco.MjData(model)
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, 50)
+        after.append(data.qvel.copy())
+    found = module.params(torch.zeros(4).double()).B[2:].T
+    np.testing.assert_allclose(found, np.array(after[1:]) - after[0], rtol=0.15, atol=1e-3)
+
+
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
 def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     model = load(

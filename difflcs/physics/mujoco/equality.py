@@ -1,8 +1,9 @@
 """Equality constraints of a MuJoCo model, which have no forces of their own in the system.
 
-MuJoCo's are soft: with the derivative E of the violation r their force is f = (−b E ν − k d r − E ν̇)/R. So they add to
-motion by M ν̇ = τ the mass Eᵀ E/R, the damping Eᵀ b E/R and the stiffness Eᵀ k d E/R. Without velocities, with the
-response S, 1 − S Eᵀ (E S Eᵀ)⁺ E projects the motion, and what forces do to it, to where they hold.
+MuJoCo's are soft: with the derivative E of the violation r their force is f = (−b E ν − k d r − E ν̇)/R. They are part
+of dynamic motion as MuJoCo simulates and linearises it, in which other forces meet more mass, by Eᵀ E/R, and damping,
+by Eᵀ b E/R. Without velocities, with the response S, 1 − S Eᵀ (E S Eᵀ)⁺ E projects the motion, and what forces do to
+it, to where they hold.
 """
 
 import copy
@@ -26,16 +27,14 @@ class EqualityRows(NamedTuple):
     """Equality constraints of n states.
 
     Attributes:
-        gap: (n, k) r at ζ = 0, of the linear function of ζ that is r where it was read.
+        gap: (n, k) r.
         normal: (n, k, nv) its derivative E by the degrees of freedom.
-        stiffness: (n, k) k d [1/s²].
         damping: (n, k) b [1/s].
         force: (n, nv, k) Eᵀ/R.
     """
 
     gap: Array
     normal: Array
-    stiffness: Array
     damping: Array
     force: Array
 
@@ -77,31 +76,13 @@ class Equality:
                 gives = np.empty_like(jacobian)
                 mujoco.mj_solveM(model, data, gives, jacobian)
                 firm = np.maximum(data.efc_R, _FIRMEST * (gives * jacobian).sum(-1))
-                rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, :3], firm)])
-        gap, normal, reference, regularisation = map(np.stack, zip(*rows, strict=True))
-        if moved is not None:
-            gap = gap - (normal @ moved[:, :, None])[:, :, 0]
-        stiffness = reference[..., 0] * reference[..., 2]
-        return EqualityRows(
-            gap, normal, stiffness, reference[..., 1], normal.swapaxes(-1, -2) / regularisation[:, None]
-        )
+                rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, 1], firm)])
+        gap, normal, damping, regularisation = map(np.stack, zip(*rows, strict=True))
+        return EqualityRows(gap, normal, damping, normal.swapaxes(-1, -2) / regularisation[:, None])
 
     def hold(self, motion: Dynamic, read: Linearised, x: Array, qpos: Array) -> DynamicStep:
         """Return the step with the constraints from states x (n, n_x), which have positions qpos (n, nq)."""
-        rows = self.read(qpos)
-        step = motion.finish(read, x, rows)
-        if rows is None:
-            return step
-        # As they turn, they are linearised half way.
-        rows = self.read(qpos, 0.5 * step.place)
-        step = motion.finish(read, x, rows)
-        after = self.read(qpos, step.place)
-        assert rows is not None
-        assert after is not None
-        nv = step.place.shape[1]
-        turned = (after.normal - rows.normal) @ step.reached[:, nv : 2 * nv, None]
-        step.step[:, nv : 2 * nv, -1] -= (step.inverse_mass @ rows.force @ turned)[:, :, 0]
-        return step
+        return motion.finish(read, x, self.read(qpos, read.middle[:, : motion.model.nv]))
 
     def hold_positions(self, free: FreeMotion, x: Array, qpos: Array, tangent: Array | None) -> FreeMotion:
         """Return a motion of positions x (n, nv), which are qpos (n, nq), that keeps to the constraints."""

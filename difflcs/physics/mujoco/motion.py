@@ -153,7 +153,7 @@ class Dynamic:
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
         self.steps = Steps(max(1, round(seconds / model.opt.timestep)), int(model.opt.integrator))
         coarse = self.steps.integrator if self.steps.integrator in (_RK4, _DISCRETE) else _IMPLICIT
-        self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
+        self.simulated = self.steps if self.steps.count <= _MOST or model.neq else Steps(_FEW, coarse)
         damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
@@ -162,7 +162,7 @@ class Dynamic:
         self.firm = np.isin(
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
-        self.flags = flags("CONSTRAINT")
+        self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
         self._native = {steps: self.describe(steps, self.flags) for steps in (self.simulated, self.finer)}
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
@@ -255,8 +255,12 @@ class Dynamic:
         if steps.integrator == _DISCRETE:  # whose acceleration is that of the whole step
             simulated.opt.disableflags |= flags("EULERDAMP")
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        linearised.opt.disableflags |= self.flags | flags("EULERDAMP")
+        for any_step in (simulated, linearised):  # equality constraints are as soft as in the model's own steps
+            softened = (any_step.eq_solref[:, 0] > 0) & (not model.opt.disableflags & flags("REFSAFE"))
+            any_step.eq_solref[softened, 0] = np.maximum(any_step.eq_solref[softened, 0], 2 * model.opt.timestep)
+        linearised.opt.disableflags |= self.flags | flags("EULERDAMP", "REFSAFE")
         linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
+        linearised.opt.solver, linearised.opt.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-15
         actuators.unlimit_rates(linearised)
         fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
         fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": steps.count}
@@ -271,33 +275,28 @@ class Dynamic:
         rates, B = read.A[:, nv:] - np.eye(n_x)[nv:], read.B[:, nv:]
         # With ν = 0, ζ = 0 and u = ū.
         load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
-        forces, mass = (
-            np.concatenate([rates, B, load[:, :, None]], -1),
-            np.linalg.inv(read.inverse_mass).astype(np.float64),
-        )
-        damping = np.diag(self.damping) if self.steps.integrator == _EULER else -mass @ rates[:, :nv, nv : 2 * nv]
-        free, inverse_mass, heavier = forces, read.inverse_mass, mass
-        if equality is not None:
-            heavier, forces = _add_equality(mass, forces, equality)
+        forces = np.concatenate([rates, B, load[:, :, None]], -1)
+        mass, inverse_mass = np.linalg.inv(read.inverse_mass).astype(np.float64), read.inverse_mass
+        heavier, drag = mass, np.zeros_like(mass)
+        if equality is not None:  # the rates have them
+            heavier = mass + equality.force @ equality.normal
             inverse_mass = np.linalg.inv(heavier).astype(np.float64)
+            drag = equality.force @ (equality.damping[:, :, None] * equality.normal)
+        slow = -heavier @ rates[:, :nv, nv : 2 * nv] - drag
+        damping = np.diag(self.damping) if self.steps.integrator == _EULER else slow
         response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         held = heavier if self.steps.integrator == _DISCRETE else mass
         step, implicit = self._steps(held, forces, damping, self.steps), self._implicit(response @ heavier, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        same = self.simulated == self.steps and equality is None
-        simulated = step if same else self._steps(mass, free, damping, self.simulated)
+        simulated = step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated)
         if (some := read.unstable).any():
-            slow = -mass[some] @ rates[some, :nv, nv : 2 * nv]
-            simulated[some], step[some] = (self._steps(mass[some], of[some], slow, self.finer) for of in (free, forces))
+            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer)
         curved = self.actuators.curved[: read.secant.shape[2]] + n_x
         more = (read.reached - _reached(simulated, velocity))[:, :, None]
         more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
-        if equality is not None:
-            for part in (slice(nv), slice(nv, 2 * nv)):
-                more[:, part] = inverse_mass @ mass @ more[:, part]
         tangent = step[:, :, curved]
         step[:, :, [*curved, -1]] += more
         kept = (tangent * step[:, :, curved]).sum(1) / np.maximum((tangent * tangent).sum(1), 1e-300)
@@ -474,17 +473,6 @@ def _reached(step: Array, velocity: Array) -> Array:
     """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""
     nv = velocity.shape[1]
     return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]
-
-
-def _add_equality(mass: Array, forces: Array, rows: Any) -> tuple[Array, Array]:
-    """Return mass and rates with soft equality constraints, which add mass, damping and stiffness."""
-    nv, heavier = mass.shape[-1], mass + rows.force @ rows.normal
-    pull = np.zeros((*rows.gap.shape, forces.shape[-1]))
-    pull[:, :, :nv] = -rows.stiffness[:, :, None] * rows.normal
-    pull[:, :, nv : 2 * nv] = -rows.damping[:, :, None] * rows.normal
-    pull[:, :, -1] = -rows.stiffness * rows.gap
-    held: Array = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
-    return heavier, np.concatenate([held, forces[:, nv:]], 1)
 
 
 def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:
