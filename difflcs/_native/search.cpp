@@ -50,6 +50,9 @@ constexpr double kSame = 0.02;
 // multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
+// Starts from the kSoftPulses-th on, which are pulses, follow a homotopy from contact so many powers of ten softer.
+constexpr int64_t kSoftPulses = 8;
+constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // Starts are compared at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plans
 // that may win are then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan
 // where it begins.
@@ -64,26 +67,23 @@ constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
-// A variation of a plan: the actions of its first half, its second half, or all, some stages later, so many times as
-// large, and with noise, in parts of their range.
-struct Variation {
+// Local search round the best plan of the starts. One round in kRounds makes these shifts: actions of the plan, or of one
+// half of it, come some stages earlier or later. Where contacts are made and broken, an optimum next to a plan touches a
+// stage earlier or later; random starts rarely find that.
+struct Shift {
   enum { all, begin, end } part;
   int64_t later;
-  double scale, noise;
 };
-
-// Local search round the best plan of the starts. Two rounds try these, half of them each. Where contacts are made and
-// broken, an optimum next to a plan touches a stage earlier or later, or harder; random starts rarely find that.
-constexpr Variation kVariations[] = {
-    {Variation::all, 1, 1, 0},    {Variation::all, -1, 1, 0},  {Variation::all, 2, 1, 0},
-    {Variation::begin, 1, 1, 0},  {Variation::end, 1, 1, 0},   {Variation::end, -1, 1, 0},
-    {Variation::all, 0, 1.5, 0},  {Variation::all, 0, 1, 0.5}, {Variation::all, -2, 1, 0},
-    {Variation::begin, -1, 1, 0}, {Variation::all, 4, 1, 0},   {Variation::end, 2, 1, 0},
-    {Variation::end, 0, 1.5, 0},  {Variation::all, 0, 0.5, 0}, {Variation::all, 0, 1, 0.25},
-    {Variation::all, 0, 1, 1}};
-constexpr int64_t kKinds = 16, kVaried = 8, kMostRounds = 16;
-// With fewer starts than kVaried there is no local search. It ends when all variations in turn have not made the cost
-// smaller by the part kGain.
+constexpr int64_t kVaried = 8, kRounds = 4, kMostRounds = 32;
+constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
+                                    {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
+// The other rounds draw. Half of their variations have a little noise and follow a homotopy from softer contact, ten to
+// the power of kMelted to kMeltedMore times that at which starts are compared. The others are stretched in time, at most
+// by kStretched either way, or push an action for some of the horizon.
+constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
+constexpr double kShortest = 0.05, kLongest = 0.6;  // pushes, in parts of the horizon
+// With fewer starts than kVaried there is no local search. It ends when kRounds in a row have not made the cost smaller
+// by the part kGain.
 constexpr double kGain = 1e-3;
 
 // A number in [0, 1) for every triple: splitmix64.
@@ -319,6 +319,8 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Sizes n(b);
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
+  if (s.actions == Actions::pulse && start >= kSoftPulses)
+    tried.start[job].at_least *= std::pow(10.0, kSoftened + (kSoftenedMore - kSoftened) * uniform(effort.seed, start, -1));
   tried.start[job].explore = s.explore;
   tried.start[job].needed = kHuge;
   double* u = tried.u.data() + job * n.u;
@@ -533,26 +535,36 @@ bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, d
 
 // Sets the first actions of a job to those of a plan, varied.
 void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
-  const Variation& v = kVariations[kind % kKinds];
-  const int64_t begin = v.part == Variation::end ? batch.horizon / 2 : 0;
-  const int64_t end = v.part == Variation::begin ? batch.horizon / 2 : batch.horizon;
-  for (int64_t i = 0; i < batch.horizon * batch.n_u; i++) {
+  const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
+  const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
+  const bool shifted = kind / kVaried % kRounds == 0;
+  const bool melted = !shifted && kind % 2 == 1, stretched = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
+  const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
+  const int64_t begin = shift.part == Shift::end ? horizon / 2 : 0;
+  const int64_t end = shift.part == Shift::begin ? horizon / 2 : horizon;
+  const double h = double(horizon), fixed = random(drawn) < 0.5 ? 0.0 : h - 1.0;
+  const double stretch = std::pow(kStretched, 2.0 * random(drawn + 1) - 1.0);
+  const double middle = h * random(drawn), push = (random(drawn + 2) < 0.5 ? 1.0 : -1.0) * (0.25 + 0.75 * random(drawn + 3));
+  const double length = std::max(1.0, h * kShortest * std::pow(kLongest / kShortest, random(drawn + 1)));
+  const int64_t which = int64_t(double(n_u) * random(drawn + 4));
+  for (int64_t i = 0; i < horizon * n_u; i++) {
     const Bound bound(batch, tried.element[job], i);
-    const int64_t k = i / batch.n_u, j = i % batch.n_u;
-    const bool varied = begin <= k && k < end;
-    const int64_t from = varied ? std::min(std::max(k + v.later, begin), end - 1) : k;
-    const double action = (varied ? v.scale : 1.0) * plan[from * batch.n_u + j];
+    const int64_t k = i / n_u, j = i % n_u;
+    int64_t from = begin <= k && k < end ? std::min(std::max(k + shift.later, begin), end - 1) : k;
+    if (stretched) from = std::min(std::max(std::lround(fixed + (double(k) - fixed) * stretch), 0l), horizon - 1);
+    double action = plan[from * n_u + j];
     const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(action);
-    tried.u[job * batch.horizon * batch.n_u + i] =
-        bound.clip(action + v.noise * range * (2.0 * uniform(effort.seed, -1 - kind, i) - 1.0));
+    if (pushed && j == which && std::abs(double(k) - middle) <= 0.5 * length) action += push * range;
+    if (melted) action += kNoise * range * (2.0 * random(i) - 1.0);
+    tried.u[job * horizon * n_u + i] = bound.clip(action);
   }
+  if (melted) tried.start[job].at_least *= std::pow(10.0, kMelted + (kMeltedMore - kMelted) * random(drawn));
 }
 
 // Varies the plans of those elements that `search` left, and keeps what is better, until that gains nothing.
 void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                         int64_t first, int64_t count) {
   const Sizes n(batch);
-  const int64_t patience = kKinds / kVaried;
   idle.assign(count, 0);
   const auto done = [&](int64_t e) { return effort.starts < kVaried || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
@@ -582,7 +594,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) idle[e] = -1;
       copy_plan(n, finished.plans(), i, out, e);
     }
-    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= patience; }), live.end());
+    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= kRounds; }), live.end());
   }
 }
 
