@@ -36,11 +36,12 @@ Start start_of(int64_t i) {
 
 // The first starts, which have no large actions.
 constexpr int64_t kNear = 2;
-// If of half of the starts, kHalf for each action at least, kFound find the best plan and at most kLone end where no
-// other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Starts after the first
-// kFixed are left where they seem not to come below the best cost by this part of it.
-constexpr int64_t kHalf = 8;
-constexpr double kEqual = 3e-4, kFound = 1.0 / 4.0, kLone = 1.0 / 8.0;
+// If of half of the starts, kHalf for each action at least, one in kFound finds the best plan and at most one in kLone
+// ends where no other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Four
+// that agree so are spared the local search. Starts after the first kFixed are left where they seem not to come below the
+// best cost by this part of it.
+constexpr int64_t kHalf = 8, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
+constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
 // A bound that is this many times farther than that plan counts as none.
 constexpr double kReach = 3.0, kNone = 100.0;
@@ -67,9 +68,9 @@ constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
-// Local search round the best plan of the starts. One round in kRounds makes these shifts: actions of the plan, or of one
-// half of it, come some stages earlier or later. Where contacts are made and broken, an optimum next to a plan touches a
-// stage earlier or later; random starts rarely find that.
+// Local search round the best plan of the starts. One round in kRounds makes these shifts: actions of the plan, or of
+// one half of it, come some stages earlier or later. Where contacts are made and broken, an optimum next to a plan
+// touches a stage earlier or later; random starts rarely find that.
 struct Shift {
   enum { all, begin, end } part;
   int64_t later;
@@ -78,12 +79,13 @@ constexpr int64_t kVaried = 8, kRounds = 4, kMostRounds = 32;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
 // The other rounds draw. Half of their variations have a little noise and follow a homotopy from softer contact, ten to
-// the power of kMelted to kMeltedMore times that at which starts are compared. The others are stretched in time, at most
-// by kStretched either way, or push an action for some of the horizon.
+// the power of kMelted to kMeltedMore times that at which starts are compared. The others are stretched in time, at
+// most by kStretched either way, or push an action for some of the horizon.
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
-constexpr double kShortest = 0.05, kLongest = 0.6;  // pushes, in parts of the horizon
-// With fewer starts than kVaried there is no local search. It ends when kRounds in a row have not made the cost smaller
-// by the part kGain.
+constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
+constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
+// It ends when kRounds in a row have not made the cost smaller by the part kGain. With fewer starts than kVaried there
+// is one round, of half of the shifts; with fewer than kFixed none.
 constexpr double kGain = 1e-3;
 
 // A number in [0, 1) for every triple: splitmix64.
@@ -97,6 +99,8 @@ double uniform(uint64_t seed, int64_t start, int64_t position) {
   }
   return double(z >> 11) * 0x1p-53;
 }
+
+double power_of_ten(double low, double high, double part) { return std::pow(10.0, low + (high - low) * part); }
 
 // Action `j` of stage `k` in a random pulse, in parts of the way from none to a bound: one way for at most the first
 // kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then
@@ -224,7 +228,7 @@ bool settled(const double* reached, int64_t count) {
     found += near(reached[i], best);
     lone += std::count_if(reached, reached + count, [&](double v) { return near(v, reached[i]); }) == 1;
   }
-  return double(found) >= kFound * double(count) && double(lone) <= kLone * double(count);
+  return found >= std::max(kLeastFound, count / kFound) && lone <= std::max(kMostLone, count / kLone);
 }
 
 }  // namespace
@@ -320,7 +324,7 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
   if (s.actions == Actions::pulse && start >= kSoftPulses)
-    tried.start[job].at_least *= std::pow(10.0, kSoftened + (kSoftenedMore - kSoftened) * uniform(effort.seed, start, -1));
+    tried.start[job].at_least *= power_of_ten(kSoftened, kSoftenedMore, uniform(effort.seed, start, -1));
   tried.start[job].explore = s.explore;
   tried.start[job].needed = kHuge;
   double* u = tried.u.data() + job * n.u;
@@ -393,7 +397,7 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
-  const int64_t starts = effort.starts, half = std::max(kHalf * batch.n_u, starts / 2);
+  const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
   const int64_t shift = guessed ? 1 : 0;
   const MpcPlans to = shifted(batch, out, first);
 
@@ -538,13 +542,15 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
   const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
   const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
   const bool shifted = kind / kVaried % kRounds == 0;
-  const bool melted = !shifted && kind % 2 == 1, stretched = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
+  const bool melted = !shifted && kind % 2 == 1;
+  const bool stretched = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
   const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
   const int64_t begin = shift.part == Shift::end ? horizon / 2 : 0;
   const int64_t end = shift.part == Shift::begin ? horizon / 2 : horizon;
   const double h = double(horizon), fixed = random(drawn) < 0.5 ? 0.0 : h - 1.0;
   const double stretch = std::pow(kStretched, 2.0 * random(drawn + 1) - 1.0);
-  const double middle = h * random(drawn), push = (random(drawn + 2) < 0.5 ? 1.0 : -1.0) * (0.25 + 0.75 * random(drawn + 3));
+  const double middle = h * random(drawn), way = random(drawn + 2) < 0.5 ? 1.0 : -1.0;
+  const double push = way * (kLeastPush + (1.0 - kLeastPush) * random(drawn + 3));
   const double length = std::max(1.0, h * kShortest * std::pow(kLongest / kShortest, random(drawn + 1)));
   const int64_t which = int64_t(double(n_u) * random(drawn + 4));
   for (int64_t i = 0; i < horizon * n_u; i++) {
@@ -558,7 +564,7 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
     if (melted) action += kNoise * range * (2.0 * random(i) - 1.0);
     tried.u[job * horizon * n_u + i] = bound.clip(action);
   }
-  if (melted) tried.start[job].at_least *= std::pow(10.0, kMelted + (kMeltedMore - kMelted) * random(drawn));
+  if (melted) tried.start[job].at_least *= power_of_ten(kMelted, kMeltedMore, random(drawn));
 }
 
 // Varies the plans of those elements that `search` left, and keeps what is better, until that gains nothing.
@@ -566,11 +572,13 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
                         int64_t first, int64_t count) {
   const Sizes n(batch);
   idle.assign(count, 0);
-  const auto done = [&](int64_t e) { return effort.starts < kVaried || !solved(out.status[e]); };
+  const bool few = effort.starts < kVaried;
+  const int64_t varied = few ? kVaried / 2 : kVaried, rounds = few ? 1 : kMostRounds;
+  const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
-  for (int64_t round = 0; round < kMostRounds && !live.empty() && !runner.stopped(); round++) {
+  for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
     // Job v * elements + i is variation v of the plan of the i-th element that is not done.
-    const int64_t elements = int64_t(live.size()), all = kVaried * elements;
+    const int64_t elements = int64_t(live.size()), all = varied * elements;
     tried.resize(batch, all);
     std::fill(tried.status.begin(), tried.status.end(), kUnreached);
     std::fill(tried.iterations.begin(), tried.iterations.end(), 0);

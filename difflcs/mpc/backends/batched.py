@@ -53,9 +53,9 @@ class BatchedBackend(Backend):
     which find contacts that are far; random pulses, a push and a brake of each action, or swings to and fro. Starts are
     compared after a few steps at the relaxation, and only those that may still win are solved to the end. The starts of
     an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
-    long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. From
-    eight starts on a local search follows, unless they agree: the best plan is varied, above all a stage or more
-    earlier or later, until that finds nothing better.
+    long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. A
+    local search follows, unless they agree: the best plan is shifted or stretched in time, pushed, or solved again from
+    softer contact, until that finds nothing better. Of four to seven starts only four shifts are tried.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
@@ -65,7 +65,7 @@ class BatchedBackend(Backend):
         effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
             n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the
             first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
-        restarts: number of starts, whatever the effort; None: that of the effort. From eight on with a local search.
+        restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
