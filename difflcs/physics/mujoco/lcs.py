@@ -412,17 +412,19 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     if not some.size:
         return
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
-    ends = torch.from_numpy(of._actuators.range)[:, None] - of.control(x, torch.zeros_like(idle))
-    usual = torch.from_numpy(of._actuators.usual)
-    ends = torch.where(ends.isfinite(), ends, idle + torch.stack([-usual, usual])[:, None])
+    zero = of.control(x, torch.zeros_like(idle))
+    ends, usual = torch.from_numpy(of._actuators.range)[:, None] - zero, torch.from_numpy(of._actuators.usual)
+    other = torch.where(usual > 0, -zero, idle)
+    likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
+    ends = torch.where(ends.isfinite(), ends, likely)
     ends = torch.cat([ends, torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))])
     absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)  # far from zero, perhaps
     u = torch.cat([ends, 0.5 * (ends + idle), torch.where(absolute, 0.0, idle)[None]]).clamp(*of.action_bounds(x))
     m, nv = len(u), of.state.nv
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
-    states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
+    states = np.tile(read.states[some], (m, 1))
     after = of._whole.simulate(of._places, states, ctrl)
-    free = of._motion.simulate(of._places, states, ctrl, unstable)
+    free = of._motion.simulate(of._places, states, ctrl, np.ones(len(states), dtype=bool))
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
     at, to, alone = (v.reshape(m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
