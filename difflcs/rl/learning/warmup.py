@@ -12,7 +12,6 @@ from torch import Tensor
 
 from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
-from difflcs.physics.frame import BodyFrameLCS
 from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state import State
@@ -108,10 +107,11 @@ def fit(
     *,
     context: Tensor | None = None,
 ) -> Fit:
-    """Fit a model to transitions by the violation loss, with a fresh Adam; a `BodyFrameLCS` in units of the data.
+    """Fit a model to transitions by the violation loss, with a fresh Adam.
 
     Args:
-        lcs: an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; changed in place.
+        lcs: an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; changed in place. Where it has a method
+            `take_units(x, u, x_next)`, the fit is to the transitions that this returns, of the system `at_rest()`.
         x: (N, n_x) states.
         u: (N, n_u) actions.
         x_next: (N, n_x) next states.
@@ -127,10 +127,11 @@ def fit(
         GammaError: gamma of the loss is too large for this model.
         InvalidInputError: the module has no learnable parameter, or its system does not depend on one.
     """
-    module, body = check_module(lcs), lcs if isinstance(lcs, BodyFrameLCS) else None
-    if body is not None:
-        (x, u, x_next), context = body.take_units(x, u, x_next), None
-    system = (lambda: lcs) if body is None else body.at_rest
+    module: Any = check_module(lcs)
+    own_units = hasattr(module, "take_units")
+    if own_units:
+        (x, u, x_next), context = module.take_units(x, u, x_next), None
+    system = module.at_rest if own_units else lambda: lcs
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
     n_train = max(1, int((1 - HELD_OUT) * len(x)))
