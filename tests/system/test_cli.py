@@ -6,10 +6,10 @@ import importlib.util
 import io
 import json
 import logging
+import multiprocessing
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -198,7 +198,7 @@ def test_a_model_in_single_precision_is_refused_before_anything_is_written(capsy
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("words", ["train --help", "zoo", "nonsense"])
+@pytest.mark.parametrize("words", ["train --help", "nonsense"])
 def test_who_reads_the_output_may_stop(words):
     """As in `difflcs train --help | head`: no traceback. The reader ends before anything is written."""
     end, mine = os.pipe()
@@ -502,22 +502,22 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
     return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of later versions of Python
 def test_resume_after_kill_9(capsys, tmp_path):
-    """Killed in the warm-up, resumed, killed in the main phase, resumed."""
+    """Killed in the warm-up, resumed, killed in the main phase, resumed; a fork has imported what takes seconds."""
     options = ["--method", "lcs-rl", "--minutes", "1.1", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
     options += "--ppo.steps 2 --warmup.epochs.first 20 --models.rollouts 4 --models.iterations 1".split()
     options += ["--final-goals", "0", "--evaluate-at"]
     through, killed = tmp_path / "through", tmp_path / "killed"
     for resume, until in ((False, 1), (True, 4)):
-        command = [sys.executable, "-m", "difflcs", "train", *options, "--out", str(killed)]
-        process = subprocess.Popen(
-            [*command, *["--resume"] * resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        words = ["train", *options, "--out", str(killed), *["--resume"] * resume]
+        process = multiprocessing.get_context("fork").Process(target=cli.main, args=(words,))
+        process.start()
         deadline = time.monotonic() + 120
         while not (killed / f"checkpoints/{until:06d}").exists() and time.monotonic() < deadline:
             time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        process.kill()
+        process.join()
         assert not (killed / "model").exists()
     assert run(capsys, "train", "--out", killed, "--resume")[0] == 0
     assert run(capsys, "train", *options, "--out", through)[0] == 0
@@ -531,9 +531,8 @@ def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
     assert "another --out" in err
 
 
-def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
-    whole, path = tmp_path / "whole", tmp_path / "run"
-    assert run(capsys, "train", "--smoke", "--method", "ppo", "--out", whole)[0] == 0
+def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monkeypatch):
+    path = tmp_path / "run"
     write, left = _storage.write_atomically, [5]  # config.json, then three files per checkpoint
 
     def full(*arguments):
@@ -544,10 +543,10 @@ def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(_storage, "write_atomically", full)
-        code, _, err = run(capsys, "train", "--smoke", "--method", "ppo", "--out", path)
+        code, _, err = run(capsys, "train", "--smoke", "--method", "violation", "--out", path)
     assert code == 2
     assert "No space left" in err
     assert "--resume" in err
     assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
-    assert learned(path) == learned(whole)
+    assert learned(path) == learned(finished)

@@ -562,7 +562,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
         (tmp_path / path.name).write_bytes(path.read_bytes())
     monkeypatch.setattr(report, "README", readme)
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    monkeypatch.setattr(report, "write_figure", lambda figure, *_: figure.draw_without_rendering())
+    monkeypatch.setattr(report, "write_figure", lambda *_: None)  # laying them out takes seconds
     shown = [name for name in scripts if (tracked / f"{name}.md").exists()]
     assert set(shown) >= {"table1", "fig_learning_curves", "fig_transfer", "small_models"}
     for name, script in scripts.items():

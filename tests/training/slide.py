@@ -1,4 +1,4 @@
-"""A small pushing system that needs no simulator, and trainers on it."""
+"""A small pushing system that needs no simulator, also one with a context, and trainers on it."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,9 +9,9 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
-from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer
+from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer, LCSParams
 from difflcs.rl import CriticSettings, EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings, PPOSettings
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.optim import UpdateRule
@@ -52,10 +52,53 @@ class Slide(gymnasium.Env):
         return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last or broken, info
 
 
+class Gains(Slide):
+    """`Slide` with another start and another gain in each episode, which is known: x₊ = x + gain·u."""
+
+    observation_space = spaces.Dict(
+        {
+            key: spaces.Box(low, high, (1,), np.float64)
+            for key, low, high in (("state", -10.0, 10.0), ("goal", -1.0, 1.0), ("context", 0.0, 1.0))
+        }
+    )
+
+    def __init__(self, drifts: bool = False):
+        super().__init__()
+        self.drifts = drifts
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.state, self.context = self.np_random.uniform(-0.1, 0.1, 1), self.np_random.uniform(0.2, 0.8, 1)
+        return {**observation, "state": self.state.copy(), "context": self.context.copy()}, info
+
+    def step(self, action):
+        observation, *rest = super().step(np.asarray(action) * self.context / 0.5)
+        self.context = self.context + 0.01 * self.drifts
+        return {**observation, "context": self.context.copy()}, *rest
+
+
+class Gain(nn.Module):
+    """x₊ = a x + effect·gain·u + λ beside a wall; the effect is underestimated, so that the MPC hardly acts."""
+
+    n_x, n_u, n_lam = 1, 1, 1
+
+    def __init__(self, effect: float = 0.2, wall: float = -9.0):
+        super().__init__()
+        self.a, self.effect = (nn.Parameter(torch.tensor(v, dtype=torch.float64)) for v in (0.97, effect))
+        self.unused = nn.Parameter(torch.zeros(2, dtype=torch.float64))
+        self.wall = wall
+
+    def params(self, x=None, context=None):
+        """The systems of gains (..., 1): the wall is soft, 0 ≤ λ ⊥ x₊ − wall + λ/2 ≥ 0."""
+        assert context is not None
+        A, B, one = self.a.view(1, 1), (self.effect * context).unsqueeze(-1), torch.ones(1, dtype=torch.float64)
+        return LCSParams(A=A, B=B, C=one[None], d=0 * one, D=A, E=B, F=1.5 * one[None], c=-self.wall * one)
+
+
 def outcome(state, action, after, goal, ended):
     """`Slide`'s, for model rollouts."""
-    success = (after - goal).abs().squeeze(-1) < 0.05
-    return -20 * (state - goal).abs().squeeze(-1) - PENALTY * (ended & ~success), success
+    success = abs(after - goal)[..., 0] < 0.05
+    return -20 * abs(state - goal)[..., 0] - PENALTY * (ended & ~success), success
 
 
 def features(state, goal, elapsed):

@@ -5,99 +5,44 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from tensordict import TensorDict
-from torch import nn
 
-from difflcs import LCSModel, LCSParams, LCSSequence
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl import Adam, Epochs, Rollouts, ViolationLoss, Warmup, WarmupSettings, collect, fit, make_actor, make_ppo
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.rollout import mpc_actions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
-from tests.training.heavy_block import FORCE, HeavyBlock, Physics, make_mpc
-from tests.training.slide import parameters, recorded, same
+from tests.training.slide import STEPS, U_MAX, Gain, Gains, parameters, recorded, same
 
-STEPS = HeavyBlock.STEPS
 LOSS = ViolationLoss(gamma="auto", xi=0.1)
-OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
 
 
-def make_envs(count: int = 4, kind: Any = HeavyBlock) -> SyncVectorEnv:
-    return SyncVectorEnv([kind] * count)
+def make_envs(count: int = 4) -> SyncVectorEnv:
+    return SyncVectorEnv([Gains] * count)
 
 
-def make_warmup(lcs: Any = None, env: SyncVectorEnv | None = None, **changes: Any) -> Warmup:
-    lcs = Physics(**OFF) if lcs is None else lcs
-    settings = WarmupSettings(
-        rollouts=Rollouts(first=4, each=3), epochs=Epochs(20, 10, 20), noise=0.1, loss=LOSS, **changes
-    )
-    return Warmup(lcs, make_mpc(lcs), make_envs() if env is None else env, settings, 0, STEPS)
-
-
-class Gains(slide.Slide):
-    """`Slide` with another gain in each episode, which is known: x₊ = x + gain·u."""
-
-    observation_space = spaces.Dict(
-        {
-            key: spaces.Box(low, high, (1,), np.float64)
-            for key, low, high in (("state", -10.0, 10.0), ("goal", -1.0, 1.0), ("context", 0.0, 1.0))
-        }
-    )
-
-    def __init__(self, drifts: bool = False):
-        super().__init__()
-        self.drifts = drifts
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed)
-        self.context = self.np_random.uniform(0.3, 0.7, 1)
-        return {**observation, "context": self.context.copy()}, info
-
-    def step(self, action):
-        observation, *rest = super().step(np.asarray(action) * self.context / 0.5)
-        self.context = self.context + 0.01 * self.drifts
-        return {**observation, "context": self.context.copy()}, *rest
-
-
-class Gain(nn.Module):
-    """x₊ = a x + effect·gain·u without contacts; the effect is underestimated, so that the MPC hardly acts."""
-
-    n_x, n_u, n_lam = 1, 1, 0
-
-    def __init__(self, effect: float = 0.2):
-        super().__init__()
-        self.a, self.effect = (nn.Parameter(torch.tensor(v, dtype=torch.float64)) for v in (0.97, effect))
-        self.unused = nn.Parameter(torch.zeros(2, dtype=torch.float64))
-        self.seen = []
-
-    def params(self, x=None, context=None):
-        assert context is not None
-        self.seen.append(context.detach().clone())
-        B = (self.effect * context).unsqueeze(-1)
-        empty = {name: torch.zeros(shape, dtype=B.dtype) for name, shape in zip("CDEFc", _EMPTY, strict=True)}
-        return LCSParams(A=self.a.view(1, 1), B=B, d=torch.zeros(1, dtype=B.dtype), **empty)
-
-
-_EMPTY = (1, 0), (0, 1), (0, 1), (0, 0), (0,)
+def make_warmup(lcs: Any) -> Warmup:
+    settings = WarmupSettings(rollouts=Rollouts(first=4, each=3), epochs=Epochs(20, 10, 20), noise=0.1, loss=LOSS)
+    return Warmup(lcs, slide.make_mpc(lcs), make_envs(), settings, 0, STEPS)
 
 
 def features(state, goal, elapsed, context):
     return torch.cat([slide.features(state, goal, elapsed), context], -1)
 
 
-def make_trainer(lcs: Any, seed: int = 0, iterations: int = 4, kind: Any = Gains, **changes: Any) -> PPO:
+def make_trainer(lcs: Any, iterations: int = 4, **changes: Any) -> PPO:
     settings = slide.small_settings(**{"violation": LOSS, **changes})
     return make_ppo(
         make_actor(slide.make_mpc(lcs), settings.std, settings.covariance),
-        make_envs(settings.rollouts, kind),
+        make_envs(settings.rollouts),
         settings,
-        seed,
+        0,
         features=features,
         total_episodes=iterations * settings.rollouts,
-        episode_steps=slide.STEPS,
+        episode_steps=STEPS,
         failure_penalty=slide.PENALTY,
     )
 
@@ -127,7 +72,7 @@ def test_each_part_of_ppo_sees_the_context_of_its_own_sample():
     cold = slide.make_mpc(Gain())
     trainer.step()
     episodes, inputs, _, _ = seen.calls[0]
-    context = episodes["context"].unsqueeze(1).expand(-1, slide.STEPS + 1, -1)
+    context = episodes["context"].unsqueeze(1).expand(-1, STEPS + 1, -1)
     assert len(context.unique()) == slide.ROLLOUTS
     assert torch.equal(inputs[..., -1:], context)
     data = episodes["policy"].flatten(0, 1)
@@ -143,7 +88,7 @@ def test_each_part_of_ppo_sees_the_context_of_its_own_sample():
 def test_a_context_that_changes_is_refused():
     env = SyncVectorEnv([lambda: Gains(drifts=True)] * 2)
     with pytest.raises(InvalidInputError, match="same context in a whole episode, got another in step 1"):
-        collect(env, mpc_actions(slide.make_mpc(Gain())), [1, 2], slide.STEPS)
+        collect(env, mpc_actions(slide.make_mpc(Gain())), [1, 2], STEPS)
 
 
 # --- the Jacobian -----------------------------------------------------------------------------------------------------
@@ -177,13 +122,13 @@ def test_any_module_has_the_jacobian_of_a_model(kind):
 
 def test_jacobian_of_a_system_for_each_sample():
     """Against central differences of the planned action, over more samples than are differentiated together."""
-    lcs = Physics(**OFF)
-    actor = make_actor(make_mpc(lcs), 0.5, "full")
+    lcs = Gain(wall=0.0)
+    actor = make_actor(slide.make_mpc(lcs), 0.5, "full")
     with torch.no_grad():
         actor.gaussian.log_std.fill_(np.log(0.25))
     generator = torch.Generator().manual_seed(0)
-    state, goal, context = (torch.rand(20, n, generator=generator, dtype=torch.float64) for n in (2, 1, 1))
-    data = TensorDict({"state": 0.3 * state, "goal": 0.1 * goal, "context": 0.3 + 2 * context}, [20])
+    state, goal, context = (torch.rand(20, 1, generator=generator, dtype=torch.float64) for _ in range(3))
+    data = TensorDict({"state": 0.3 * state - 0.2, "goal": 0.4 * goal - 0.3, "context": context}, [20])
     actor.act(data)
     data["guess"] = data["plan"].clone()
     found = actor.jacobian(data)
@@ -197,8 +142,9 @@ def test_jacobian_of_a_system_for_each_sample():
                     ends.append(actor.mpc(data["state"], data["goal"], context=data["context"]).action)
                     p.view(-1)[i] -= step
             columns.append((ends[0] - ends[1]) / 2e-5 / 0.25)
-    inside = (data["loc"].abs() < 0.99 * FORCE).squeeze(-1)
+    inside = (data["loc"].abs() < 0.99 * U_MAX).squeeze(-1)
     assert int(inside.sum()) > 5
+    assert int((data["plan", "lam"].amax((1, 2)) > 1e-3).sum()) > 5
     assert bool(found[inside].any())
     torch.testing.assert_close(found[inside], torch.stack(columns, -1)[inside], rtol=1e-3, atol=1e-3)
 
@@ -206,16 +152,16 @@ def test_jacobian_of_a_system_for_each_sample():
 # --- resuming ---------------------------------------------------------------------------------------------------------
 
 
-class Tied(Physics):
+class Tied(Gain):
     """One parameter under two names."""
 
-    def __init__(self, **numbers: float):
-        super().__init__(**numbers)
-        self.again = self.logarithms["damping"]
+    def __init__(self):
+        super().__init__()
+        self.again = self.effect
 
 
 def test_tied_parameters_are_saved(tmp_path):
-    first, second = make_warmup(Tied(**OFF)), make_warmup(Tied(**OFF))
+    first, second = make_warmup(Tied()), make_warmup(Tied())
     first.step()
     save_checkpoint(tmp_path, first.iteration, first.state_dict())
     second.load(load_checkpoint(tmp_path))
@@ -224,13 +170,10 @@ def test_tied_parameters_are_saved(tmp_path):
 
 
 def test_load_refuses_another_module():
-    class Other(Physics):
-        pass
-
-    state = make_warmup().state_dict()
-    assert state["learned"]["settings"] == {"class": "Physics", "n_x": 2, "n_u": 1, "n_lam": 1}
+    state = make_warmup(Gain()).state_dict()
+    assert state["learned"]["settings"] == {"class": "Gain", "n_x": 1, "n_u": 1, "n_lam": 1}
     with pytest.raises(CheckpointError, match="other settings"):
-        make_warmup(Other(**OFF)).load(state)
+        make_warmup(Tied()).load(state)
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -257,10 +200,16 @@ class Wide(Gain):
     n_u = 2
 
 
+class Tall(Gain):
+    """As many states as no environment here has."""
+
+    n_x = 2
+
+
 class NotAModule:
     """An `LCSModule`, but no `torch.nn.Module`."""
 
-    n_x, n_u, n_lam = 1, 1, 0
+    n_x, n_u, n_lam = 1, 1, 1
     params = Gain.params
 
 
@@ -274,7 +223,7 @@ BAD = [
 
 def slide_warmup(lcs: Any) -> Warmup:
     settings = WarmupSettings(rollouts=Rollouts(2, 2), epochs=Epochs(2, 2, 20), loss=LOSS)
-    return Warmup(lcs, None, make_envs(2, Gains), settings, 0, slide.STEPS)  # pyright: ignore[reportArgumentType]
+    return Warmup(lcs, None, make_envs(2), settings, 0, STEPS)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(("lcs", "error", "message"), BAD)
@@ -291,13 +240,10 @@ def test_other_sizes_than_the_environments_are_refused():
     with pytest.raises(InvalidInputError, match=r"n_x=1, n_u=1 like the states and actions .* n_u=2 of Wide"):
         slide_warmup(Wide())
     with pytest.raises(InvalidInputError, match=r"lcs: expected n_x=1, n_u=1 .* got n_x=2"):
-        slide_warmup(Physics())
-    settings = slide.small_settings()
-    with pytest.raises(InvalidInputError, match=r"actor: expected n_x=2, n_u=1 .* got n_x=1"):
-        make_ppo(
-            make_actor(slide.make_mpc(Gain()), settings.std), make_envs(12), settings, 0, features=features,
-            total_episodes=12,
-        )  # fmt: skip
+        slide_warmup(Tall())
+    settings, mpc = slide.small_settings(), LCSMPCLayer(LCSModel(2, 1, 1), GoalCost.reach(2, 1), 3, -1.0, 1.0)
+    with pytest.raises(InvalidInputError, match=r"actor: expected n_x=1, n_u=1 .* got n_x=2"):
+        make_ppo(make_actor(mpc, settings.std), make_envs(12), settings, 0, features=features, total_episodes=12)
 
 
 @pytest.mark.parametrize("update", ["natural", "adam"])

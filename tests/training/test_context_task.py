@@ -23,32 +23,22 @@ from difflcs.rl import (
     train,
 )
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
-from tests.training.heavy_block import FORCE, HeavyBlock, Physics
-
-STEPS = HeavyBlock.STEPS
-OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
-
-
-def outcome(state, action, after, goal, ended):
-    error = abs(after[..., 0] - goal[..., 0])
-    return -10 * error, error < 0.03
-
+from tests.training import slide
+from tests.training.slide import STEPS, U_MAX, Gain, Gains
 
 TASK = TaskSpec(
-    name="heavy-block",
-    env=HeavyBlock,
-    make_cost=lambda: GoalCost.reach(2, 1, goal_weight=(20.0,), input_weight=0.002),
-    u_min=-FORCE,
-    u_max=FORCE,
-    horizon=6,
+    name="gains",
+    env=Gains,
+    make_cost=lambda: GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=0.1),
+    u_min=-U_MAX,
+    u_max=U_MAX,
+    horizon=3,
     episode_steps=STEPS,
-    step_seconds=0.1,
+    step_seconds=0.2,
     n_context=1,
-    features=lambda state, goal, elapsed, context: torch.cat(
-        [5 * (state[..., :1] - goal), state[..., 1:], context.log1p(), elapsed.unsqueeze(-1)], -1
-    ),
-    outcome=outcome,
-    physics=PhysicsSpec(make_system=lambda: Physics(**OFF), scale=(1.0, 1.0)),
+    features=lambda state, goal, elapsed, context: torch.cat([slide.features(state, goal, elapsed), context], -1),
+    outcome=slide.outcome,
+    physics=PhysicsSpec(make_system=Gain, scale=(1.0,)),
 )
 
 
@@ -58,7 +48,7 @@ TASK = TaskSpec(
     sorted({*method_names()} - {"violation", "ppo", "mujoco-lcs", "frame-lcs"}),
 )
 def test_every_method_trains_a_task_with_a_context(method, tmp_path):
-    config = replace(TrainConfig(task="heavy-block", method=get_method(method)()).smoke(), minutes=0.6)
+    config = replace(TrainConfig(task="gains", method=get_method(method)()).smoke(), minutes=0.6)
     run = train(config, tmp_path / "run", task=TASK)
     policy = load_policy(run, TASK)
     envs = TASK.make_envs(4)
@@ -72,14 +62,14 @@ def test_networks_see_the_context():
     rng = np.random.default_rng(0)
     episodes, unseen = (collect(env, uniform_actions(env, rng), range(first, first + 40), STEPS) for first in (0, 100))
     ensemble = EnsembleSettings(networks=1, width=32, epochs=Epochs(80, 3, 64))
-    models = ModelRollouts(env, outcome, ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
+    models = ModelRollouts(env, slide.outcome, ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
     models.add(episodes)
     models.fit()
     start, _ = models.env.reset(seed=3)
     known = {tuple(x): c for x, c in zip(episodes["state"][:, 0].tolist(), episodes["context"].tolist(), strict=True)}
     assert [known[tuple(x)] for x in start["state"].tolist()] == start["context"].tolist()
 
-    actions = rng.uniform(-FORCE, FORCE, (10, 1))
+    actions = rng.uniform(-U_MAX, U_MAX, (10, 1))
     after, _, _, _, _ = models.env.step(actions)
     np.testing.assert_array_equal(after["context"], start["context"])
     before, taken = torch.from_numpy(start["state"]).unsqueeze(1), torch.from_numpy(actions)[:, None, None]
@@ -92,6 +82,6 @@ def test_networks_see_the_context():
     errors = []
     for given in (context, context.flip(0)):
         with torch.no_grad():
-            found = models.ensemble(append_context(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :2]
+            found = models.ensemble(append_context(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :1]
         errors.append(float((found - x_next).square().mean().sqrt()))
     assert errors[0] < 0.5 * errors[1]
