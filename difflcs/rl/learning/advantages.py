@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 SAMPLES = ("action", "action_log_prob")
+ZETA = 0.5
+"""ζ of advantages of many actions."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ class MultiActionAdvantages:
         scale: RewardScale,
         bounds: tuple[Tensor, Tensor],
         actions: int,
-        zeta: float,
+        zeta: float = ZETA,
     ):
         self.env, self.critic, self.features, self.scale, self.bounds = env, critic, features, scale, bounds
         self.actions, self.zeta = actions, zeta

@@ -15,7 +15,9 @@ from difflcs.rl.learning.state import State
 from difflcs.rl.seeding import seeded
 from difflcs.rl.settings import MOST_WIDTH, Epochs, Settings, bounded, group
 
-_WEIGHT_DECAY = 1e-4  # of AdamW
+_LEARNING_RATE, _WEIGHT_DECAY = 2e-3, 1e-4  # of AdamW; the step size falls linearly to zero in each fit
+_ITERATIONS = 3
+"""Newest iterations whose episodes the network is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +26,9 @@ class CriticSettings(Settings):
 
     width: int = bounded(64, minimum=1, maximum=MOST_WIDTH)
     """Width of its two hidden layers."""
-    learning_rate: float = bounded(2e-3, above=0)
-    """Step size of AdamW at the start of each fit; it falls linearly to zero."""
     epochs: Epochs = group(Epochs, first=80, each=10, minibatch=256)
     """Passes over its data: on the discounted returns of the first episodes, before the first advantages; and at the
     end of each iteration."""
-    iterations: int = bounded(3, minimum=1)
-    """Newest iterations whose episodes it is fitted to."""
 
 
 class Critic:
@@ -88,7 +86,7 @@ class Critic:
             key: of random numbers.
             epochs: passes over the episodes.
         """
-        self.history = [*self.history, (inputs, rewards)][-self.settings.iterations :]
+        self.history = [*self.history, (inputs, rewards)][-_ITERATIONS:]
         targets = [self.gae(*part).targets for part in self.history]
         seen = torch.cat([inputs[:, :-1] for inputs, _ in self.history])
         self._fit(seen, torch.cat(targets), epochs, (*key, len(self.history) + 1))
@@ -103,7 +101,7 @@ class Critic:
                 for batch in torch.randperm(len(x)).split(minibatch):
                     _, layer_gradients = gradients(layers, tanh, x[batch].unsqueeze(0), y[batch].view(1, -1, 1))
                     parts = [part for weight, bias in layer_gradients for part in (weight.mT.flatten(), bias.flatten())]
-                    self._adam.step(torch.cat(parts), self.settings.learning_rate * (1 - done / steps))
+                    self._adam.step(torch.cat(parts), _LEARNING_RATE * (1 - done / steps))
                     done += 1
 
     def state_dict(self) -> dict[str, Any]:
@@ -125,9 +123,9 @@ class Critic:
         """
         episodes = state["episodes"]
         ages, counts = torch.unique_consecutive(episodes["iteration"], return_counts=True)
-        if not torch.equal(ages, torch.arange(len(ages))) or len(ages) > self.settings.iterations:
+        if not torch.equal(ages, torch.arange(len(ages))) or len(ages) > _ITERATIONS:
             raise CheckpointError(
-                f"checkpoint: expected at most {self.settings.iterations} iterations of episodes, numbered from 0, got "
+                f"checkpoint: expected at most {_ITERATIONS} iterations of episodes, numbered from 0, got "
                 f"{ages[:9].tolist()}; is it damaged?"
             )
         self.network.load_state_dict(state["network"])

@@ -54,8 +54,6 @@ class ModelRolloutSettings(Settings):
     """Epochs of the value network at the end of such an iteration."""
     actions: int = bounded(8, minimum=1, maximum=MOST_ENVS)
     """Actions that the networks judge in each state, an even number; 1: only the one that is taken, by GAE."""
-    zeta: float = bounded(0.5, minimum=0, maximum=1)
-    """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
     real_step: float = bounded(0.3, above=0)
     """Factor on the gradient steps on real episodes where there are model rollouts: their gradient is noisier."""
     ensemble: EnsembleSettings = group(EnsembleSettings)

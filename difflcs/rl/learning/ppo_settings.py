@@ -18,7 +18,7 @@ from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import AdamUpdate, Natural, NaturalUpdate, UpdateRule
 from difflcs.rl.learning.optim.update import Deviation
 from difflcs.rl.learning.ppo import PPO, Source
-from difflcs.rl.learning.surrogate import Surrogate
+from difflcs.rl.learning.surrogate import OUTLIER_KL, Surrogate
 from difflcs.rl.rollout import CONTEXT, action_bounds, has_context
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Adam, Settings, ViolationLoss, bounded, group
@@ -55,8 +55,6 @@ class PPOSettings(Settings):
     """KL divergence at which an iteration ends early."""
     final_step: float = bounded(0.3, above=0)
     """Factor on all steps, falling linearly from 1 to this over the main phase; 1 turns this off."""
-    outlier_kl: float = bounded(2.0, above=0)
-    """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
     clip: float = bounded(0.3, above=0)
     """Epsilon of the clipped objective (Eq. 4 of the paper)."""
     gamma: float = bounded(0.99, minimum=0, maximum=1)
@@ -150,7 +148,7 @@ def make_ppo(
     if models is not None:
         rollouts = models.settings
         bounds = action_bounds(env)
-        many = MultiActionAdvantages(models.env, critic, features, scale, bounds, rollouts.actions, rollouts.zeta)
+        many = MultiActionAdvantages(models.env, critic, features, scale, bounds, rollouts.actions)
         practice = Source(
             models.env,
             many if rollouts.actions > 1 else judge,
@@ -168,7 +166,7 @@ def make_ppo(
         actor,
         Source(env, judge, settings.steps, settings.minibatch, settings.critic.epochs.each),
         critic,
-        Surrogate(actor, settings.clip, settings.outlier_kl, settings.beta, settings.violation if lcs else None),
+        Surrogate(actor, settings.clip, OUTLIER_KL, settings.beta, settings.violation if lcs else None),
         _UPDATES[settings.update](actor, settings, deviation),
         scale,
         seed,

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from difflcs.records import LCSModule
     from difflcs.rl.learning.policy import GaussianPolicy
 
+OUTLIER_KL = 2.0
+"""Samples with a KL divergence above this are left out: the MPC has jumped to another optimum."""
 _VIOLATION_BATCH = 300
 """Transitions of the newest episodes per step in the violation loss."""
 

@@ -15,6 +15,8 @@ from difflcs.rl.settings import Settings, bounded
 
 _MEMORY = 0.7
 """Weight of the metric so far against that of a new measurement."""
+DAMPING = 0.1
+"""Isotropic part of the metric of a policy, in means of its diagonal."""
 _LONGEST = 3.0
 """Longest Jacobian of one sample, in medians of those of its batch: samples near a jump of the MPC have huge ones."""
 
@@ -27,8 +29,6 @@ class Natural(Settings):
     """Length of a step at the start: the root of twice the KL divergence that it makes."""
     momentum: float = bounded(0.8, minimum=0, below=1)
     """Weight of the gradient so far against the newest one; kept across iterations. 0 turns it off."""
-    damping: float = bounded(0.1, above=0)
-    """Isotropic part of the metric, in means of its diagonal."""
 
 
 class NaturalGradient(torch.optim.Optimizer):
