@@ -87,8 +87,11 @@ def differentiable(build, backend="batched"):
     return {**leaves, "q": cost.q, "q_final": cost.q_final, "r": cost.r, "u_min": low, "u_max": high, "x0": x0}, layer
 
 
-@pytest.mark.parametrize("backend", ["batched", "ipopt", "relaxed"])
-@pytest.mark.parametrize("name", ["A", "C", "F", "c", "q", "r", "u_min", "x0"])
+# Inputs are kept by the one bridge to autograd, whatever the backend.
+@pytest.mark.parametrize(
+    ("name", "backend"),
+    [*((name, "batched") for name in ("A", "C", "F", "c", "q", "r", "u_min", "x0")), ("A", "ipopt"), ("A", "relaxed")],
+)
 def test_an_input_changed_in_place_raises_torchs_error(build, backend, name):
     inputs, layer = differentiable(build, backend)
     plan = layer(inputs["x0"])
