@@ -120,6 +120,22 @@ def test_friction_holds_against_another_action_than_the_nominal_one(force):
     assert float((after - module.state.to_state(data.qpos, data.qvel))[1].abs()) < 0.03
 
 
+def test_a_stiff_servo_that_presses_a_finger_against_its_limit_moves_neither_it_nor_the_arm():
+    stop = '<joint name="a" axis="0 1 0" damping="5" range="-1 0"/>'
+    hard = 'damping="1000" armature="1" range="0 .05" solreflimit=".002 1" solimplimit=".99 .999 .01"'
+    finger = f'<body><joint name="j" type="slide" axis="0 0 1" {hard}/><geom size=".02" mass=".1"/></body>'
+    arm = f'<body pos="0 0 1">{stop}<geom size=".05" mass="1" pos=".2 0 0"/>{finger}</body>'
+    model = load(arm, '<actuator><position joint="j" kp="30000" ctrlrange="0 .2"/></actuator>')
+    data = mujoco.MjData(model)
+    data.qpos[1] = data.ctrl[0] = 0.05
+    mujoco.mj_step(model, data, 500)
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
+    x, u = module.observe(data), torch.tensor([0.01]).double()
+    data.ctrl[:] = module.control(x, u).numpy()
+    mujoco.mj_step(model, data, 20)
+    assert np.abs(module.params(x).step(x, u).x_next[2:].numpy() - data.qvel).max() < 5e-3
+
+
 def test_an_action_against_an_equality_constraint_that_is_far_from_held_does_what_it_does_in_mujoco():
     arm = BAR.format("a", 0, LINK + '<site name="tip" pos="0 0 .3"/>') + '<site name="far" pos=".4 0 1.2"/>'
     model = load(arm, '<actuator><motor joint="a"/><motor joint="b"/></actuator>'

@@ -31,6 +31,7 @@ from difflcs.records import LCSParams, advance
 Array = NDArray[np.float64]
 _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
 _FARTHER = 0.25  # of the speed before and of what forces do, by which an error is more than that of standing still
+_JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 
@@ -121,13 +122,20 @@ def correct(
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
     worse = (size(wrong) - size(change)) / (_WORSE * (size(speed) + size(free)) + 1e-9)
     share = energy[:, :, :n_contacts].sum(-1) / total
-    counts = 1 - share * (1 - np.clip(worse, 0.0, 1.0))
+    # What contacts jam stands with any action.
+    pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (size(speed) + size(free)), 1e-300))
+    counts = 1 - share / pressed * (1 - np.clip(worse, 0.0, 1.0))
     moves = size(speed) + size(change)
     least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
     doubtful = (size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)
-    # Dry friction far below its bound is whatever holds: the difference does not grow with it.
-    of_friction = slice(n_contacts + n_limits, n_contacts + n_limits + n_bounded)
-    energy[:, :, of_friction] *= np.abs(forces[:, None, of_friction]) / np.maximum(bound, 1e-300)[:, None]
+    # A difference that grew with a force that actions change by far would be many times as large with some. Dry
+    # friction far below its bound is whatever holds, so it does not grow with this either.
+    of_rows = slice(n_contacts, n_contacts + n_limits + n_bounded)
+    does = np.abs((rows.normal.swapaxes(-1, -2) * C[:, nv : 2 * nv, of_rows] * forces[:, None, of_rows]).sum(1))
+    changes = np.abs(rows.normal @ step.step[:, nv : 2 * nv, x.shape[1] : -1]) @ step.motion.actuators.reach
+    firm = does / np.maximum(does + changes, 1e-300)
+    firm[:, n_limits:] *= np.abs(forces[:, of_rows][:, n_limits:]) / np.maximum(bound, 1e-300)
+    energy[:, :, of_rows] *= firm[:, None]
     grow = energy.sum(-1)
     due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15)) * grow / total
     part = energy / np.where(forces != 0, forces, 1.0)[:, None] / np.maximum(grow, 1e-20)[:, :, None]

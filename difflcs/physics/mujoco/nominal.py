@@ -32,6 +32,7 @@ _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceler
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
 _GAINS = 1.0  # of the speeds before the step and without contact, which contacts and limits do not make faster
 _EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
+_LATE = 10.0  # the most of the same, of what stiff drives press against a limit
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -236,10 +237,12 @@ def _settle(at: Situation, at_once: Array) -> tuple[ScaledRows, Array]:
     # A limit holds at the depth that it has after the step, friction after its creep.
     depth = np.minimum(rows.gap + after.moved, 0.0)
     gap = np.where(is_limit, rows.gap + 2 * rows.bend - depth, -after.moved * holds)
-    # What only another action brings to its limit is pressed there all the time: half an impulse does as much.
-    reach = np.abs(rows.normal @ step.step[:, :nv, step.x.shape[1] : -1]).sum(-1)
-    pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
-    part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.25)
+    # What only another action brings to its limit is pressed there all the time: what holds its place stops it.
+    far, fast = (rows.normal @ by for by in np.split(step.step[:, : 2 * nv, step.x.shape[1] : -1], 2, 1))
+    pressed = ~holds & (np.abs(rows.gap) < np.abs(far).sum(-1)) & ~(after.acts & (rows.gap > 0))
+    late = (far * fast).sum(-1) / np.maximum(h * (fast * fast).sum(-1), 1e-300)
+    part = np.clip(after.part, _EARLY, 1.25)
+    part = np.where(is_limit & pressed, np.clip(late, _EARLY, _LATE), part)
     part = np.where(~is_limit & after.stops | at_once[:, None], 1.0, part)
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
