@@ -23,6 +23,7 @@ import json
 import math
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from body_paths import BodyPaths
 from numpy.typing import NDArray
 from push_t import Rigid
 from scipy.sparse import csr_array
@@ -43,7 +45,7 @@ from difflcs.mpc import MPCSolution
 from difflcs.physics import Polygon, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, Mode, SamplingPolicy, SamplingSettings, Workspace
-from difflcs.planning.outline import DistanceGrid, ring
+from difflcs.planning.outline import DistanceGrid, clearance, ring
 from difflcs.planning.places import from_body
 from difflcs.rl import wilson_interval
 
@@ -114,7 +116,7 @@ class Body:
                 points.append(a + t / len(t) * (b - a))
         points = torch.cat(points)
         self.outline = points[shape.distance(points).distance.amin(-1) > -1e-6]
-        self.grid = DistanceGrid(shape, 1.0)
+        self.grid = DistanceGrid(partial(clearance, shape), shape.radius + 1.0)
         self.ring = ring(shape, RADIUS + 0.1, 20)
 
 
@@ -288,108 +290,6 @@ class TableTravel:
         return (gap >= least - 1e-9).all(-1)
 
 
-def _shortest(turns: Tensor) -> Tensor:
-    """Return the same turns within half a turn to either side [rad]."""
-    return torch.remainder(turns + math.pi, 2 * math.pi) - math.pi
-
-
-class BodyPaths:
-    """Paths of poses of one body to a goal, round the others as they lie: Dijkstra's on a grid of poses.
-
-    Args:
-        table: with all bodies.
-        moved: number of the body.
-        side: of the square that it should stay in.
-    """
-
-    CELL, TURNS = 0.25, 16
-    """Step of the grid, and steps in a turn."""
-    GYRATION = 0.4
-    """Length of a rad."""
-    AHEAD = 0.5
-    """Least way to a subgoal."""
-
-    def __init__(self, table: Table, moved: int, side: float):
-        self.table, self.moved = table, moved
-        axis = torch.arange(0.0, side + 1e-9, self.CELL, dtype=torch.float64)
-        yaw = torch.arange(self.TURNS, dtype=torch.float64) * (2 * math.pi / self.TURNS)
-        self.nodes = torch.stack(torch.meshgrid(axis, axis, yaw, indexing="ij"), -1)
-        self._key: tuple[Tensor, Tensor] | None = None
-
-    def free(self, start: Tensor, end: Tensor, margin: float) -> bool:
-        """Return True if the straight motion between two poses (3,) keeps a margin, or what its ends have."""
-        way = torch.cat([(end - start)[:2], _shortest(end - start)[2:]])
-        count = 2 + math.ceil(float(way.abs().max()) / 0.1)
-        poses = start + torch.linspace(0.0, 1.0, count, dtype=way.dtype)[:, None] * way
-        gap = self.table.body_gap(self.moved, poses)
-        return bool((gap >= min(margin, float(gap[0]), float(gap[-1])) - 1e-9).all())
-
-    def subgoal(self, goal: Tensor) -> Tensor | None:
-        """Return the farthest pose on the way from where the body is to its goal that it can go to straight.
-
-        None where there is no way.
-        """
-        start = self.table.poses[self.moved]
-        if self.free(start, goal, 0.15):
-            return goal
-        path = self._path(start, goal)
-        if path is None:
-            return None
-        ahead = [pose for pose in path if float(self._difference(pose - start)) > self.AHEAD]
-        return next((pose for pose in reversed(ahead) if self.free(start, pose, 0.08)), ahead[0] if ahead else goal)
-
-    def _path(self, start: Tensor, goal: Tensor) -> list[Tensor] | None:
-        """Find the poses from start to goal."""
-        others = torch.cat([self.table.poses[: self.moved], self.table.poses[self.moved + 1 :]])
-        key = (others.clone(), goal.clone())
-        if self._key is None or any(bool((a - b).abs().max() > 0.02) for a, b in zip(key, self._key, strict=True)):
-            self._key = key
-            self._plan(goal)
-        near = self._difference(self.nodes - start)
-        near = near + torch.where(torch.isfinite(torch.from_numpy(self._length)).reshape(near.shape), 0.0, math.inf)
-        at = int(near.argmin())
-        if not math.isfinite(float(near.flatten()[at])):
-            return None
-        path = []
-        nodes = self.nodes.reshape(-1, 3)
-        while at >= 0:
-            path.append(nodes[at])
-            at = int(self._next[at])
-        return [*path, goal]
-
-    def _difference(self, difference: Tensor) -> Tensor:
-        turn = self.GYRATION * _shortest(difference[..., 2])
-        return (difference[..., :2].square().sum(-1) + turn.square()).sqrt()
-
-    def _plan(self, goal: Tensor) -> None:
-        """Compute the way to the goal from all poses of the grid."""
-        gap = self.table.body_gap(self.moved, self.nodes).numpy()
-        valid = gap > 0.08
-        price = 1.0 + 4.0 * np.clip(0.45 - gap, 0.0, None)
-        index = np.arange(gap.size).reshape(gap.shape)
-        rows, columns, lengths = [], [], []
-        turn = self.GYRATION * 2 * math.pi / self.TURNS
-        for dx, dy, dt in itertools.product((-1, 0, 1), repeat=3):
-            if (dx, dy, dt) <= (0, 0, 0):
-                continue
-            a = index[max(0, -dx) : gap.shape[0] - max(0, dx), max(0, -dy) : gap.shape[1] - max(0, dy)]
-            b = np.roll(index, -dt, axis=2)[max(0, dx) :, max(0, dy) :]
-            b = b[: a.shape[0], : a.shape[1]]
-            a, b = a.ravel(), b.ravel()
-            both = valid.ravel()[a] & valid.ravel()[b]
-            a, b = a[both], b[both]
-            length = math.sqrt(self.CELL**2 * (dx * dx + dy * dy) + (turn * dt) ** 2)
-            rows.append(a)
-            columns.append(b)
-            lengths.append(length * np.maximum(price.ravel()[a], price.ravel()[b]))
-        graph = csr_array(
-            (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), shape=(gap.size, gap.size)
-        )
-        near = self._difference(self.nodes - goal).numpy()
-        root = int(np.where(valid, near, np.inf).argmin())
-        self._length, self._next = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
-
-
 class SeveralPolicy:
     """Moves bodies to goals, one at a time: poses and the place of the disc to the next step of the disc.
 
@@ -406,7 +306,7 @@ class SeveralPolicy:
         workspace = Workspace((-1.0, -1.0), (side + 1.0, side + 1.0), step=PUSH)
         cost = GoalCost.reach(5, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.05)
         settings = SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04)
-        self.paths = [BodyPaths(table, i, side) for i in range(len(names))]
+        self.paths = [BodyPaths(partial(table.body_gap, i), side) for i in range(len(names))]
         self.travel = travel = TableTravel(table, workspace)
         self.policies = []
         for i, body in enumerate(table.bodies):
@@ -493,8 +393,12 @@ class Scheduler:
 
     def subgoal(self, i: int, goal: Tensor) -> Tensor:
         """Return where a body is pushed on the way to its goal."""
-        found = self.paths[i].subgoal(goal) if len(self.goals) > 1 else goal
+        found = self._way(i, goal) if len(self.goals) > 1 else goal
         return goal if found is None else found
+
+    def _way(self, i: int, goal: Tensor) -> Tensor | None:
+        poses = self.table.poses
+        return self.paths[i].subgoal(poses[i], goal, torch.cat([poses[:i], poses[i + 1 :]]))
 
     def _next(self, disc: Tensor) -> int:
         """Choose the next body; sets `aside`, where it goes if not to its goal."""
@@ -504,7 +408,7 @@ class Scheduler:
             return max(range(len(self.goals)), key=lambda i: self.error(i, self.goals[i]))
         price = {i: float((self.table.poses[i, :2] - disc).norm()) + 10.0 * self._failed[i] for i in todo}
         free = [i for i in todo if float(self.table.body_gap(i, self.goals[i])) > self.MARGIN]
-        free = [i for i in free if len(self.goals) == 1 or self.paths[i].subgoal(self.goals[i]) is not None]
+        free = [i for i in free if len(self.goals) == 1 or self._way(i, self.goals[i]) is not None]
         if free:
             return min(free, key=price.__getitem__)
         for i in sorted(todo, key=price.__getitem__):

@@ -35,6 +35,7 @@ from difflcs.planning import (
     Decision,
     DiscPlaces,
     Mode,
+    Obstacles,
     PlanarTravel,
     SamplingPolicy,
     SamplingSettings,
@@ -162,6 +163,7 @@ class DiscPolicy:
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         turns: turns of the body about its centre that cover it, which all mean the same.
         beyond: how far the disc may go beyond the square [length].
+        obstacles: what is in the way of the disc and of the body, if anything.
         adapt: find the scale of the outline, friction and the stiffness of the drive from the motion seen, anew in each
             episode.
 
@@ -180,12 +182,13 @@ class DiscPolicy:
         delay: int = 0,
         turns: int = 1,
         beyond: float = 0.0,
+        obstacles: Obstacles | None = None,
         adapt: bool = False,
     ):
         self.low, self.high = -beyond, SIDE + beyond
         self.told, self.delay, self._period = system, delay, 2 * math.pi / turns
         self.center, self.goal = np.asarray(center), goal
-        self.adapts = adapt
+        self.adapts, self.obstacles = adapt, obstacles
         self._contact = DiscContact(system)
         hypotheses = np.array(list(itertools.product(SCALES, FRICTIONS)))
         self._bodies = ContextFilter(
@@ -225,15 +228,25 @@ class DiscPolicy:
     def _plan(self, system: Rigid) -> tuple[Rigid, SamplingPolicy]:
         """Make the policy for a system."""
         shape = system.shape
-        workspace = Workspace((self.low, self.low), (self.high, self.high), step=1.2)
+        workspace, obstacles = Workspace((self.low, self.low), (self.high, self.high), step=1.2), self.obstacles
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         return system, SamplingPolicy(
             LCSMPCLayer(system, cost, 6, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.02),
-            PlanarTravel(shape, RADIUS, SIDE, drive=system.drive, clearance=0.08, tolerance=0.12, workspace=workspace),
+            DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.02, obstacles=obstacles),
+            PlanarTravel(
+                shape,
+                RADIUS,
+                SIDE,
+                drive=system.drive,
+                clearance=0.08,
+                tolerance=0.12,
+                workspace=workspace,
+                obstacles=obstacles,
+            ),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),
+            constraints=None if obstacles is None else obstacles.constraints,
         )
 
     def reset(self) -> None:
@@ -266,12 +279,17 @@ class DiscPolicy:
             state = self._predict(state, target)
         goal = from_origin(self.goal, self.center)
         goal[2] += self._period * np.round((state[2] - goal[2]) / self._period)
+        goal = self._aim(state, goal)
         target = np.clip(state[3:5] + self.sampling.act(state, goal), self.low, self.high)
         self._under_way.append(target)
         sent = self._under_way.popleft() - disc
         self._before = place, self._velocities, sent
         self._velocities = self._velocities * self._A[:, 1, 1:] + self._b[:, 1:] * sent
         return target * PIXELS
+
+    def _aim(self, state: Array, goal: Array) -> Array:
+        """Choose the pose (3,) that the body is pushed to now, on its way to the goal (3,)."""
+        return goal
 
     def _predict_disc(self, place: Array, sent: Array, drives: NDArray[Any]) -> Array:
         """Predict the place of the disc (n, 2) by some drives (n, 1), with the velocity that each of them gave it."""

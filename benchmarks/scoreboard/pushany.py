@@ -16,113 +16,20 @@ inside the walls covers more than 95 % of the goal, it is out of reach; the succ
 import itertools
 import json
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import shapely
 import torch
 import tyro
-from numpy.typing import NDArray
 from pusht import STEPS, Episode, Variant, play
-from shapely import affinity
 from successes import success_figures, success_text
 
-from difflcs.errors import InvalidInputError, MissingDependencyError
-from difflcs.physics import PlanarPushing, Polygon, Union
+from difflcs.errors import InvalidInputError
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
-from push_t import PIXELS, DiscPolicy, tee_pushing
-
-try:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of pygame, about pkg_resources
-        from gym_pushany.envs.pushany_env import (  # pyright: ignore[reportMissingImports]
-            OBJECT_NAME_LIST,
-            PushAnyEnv,
-        )
-except ImportError as error:
-    raise MissingDependencyError(
-        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany==0.1.13"
-    ) from error
-
-LOW, HIGH = 7, 504  # sides of the square inside the walls [px]
-ALIKE = 0.99  # part of the area that a turn must cover for a pose to count as the same
-
-
-class StateEnv(PushAnyEnv):
-    """The environment with a state as its observation: place of the disc and pose of the body, as gym-pusht has it."""
-
-    def get_obs(self) -> NDArray[np.float64]:
-        """Return x, y of the disc, x, y and angle of the body's origin (5,) [px, rad]."""
-        return np.array([*self.agent.position, *self.block.position, self.block.angle])
-
-    def reset(self, seed: int | None = None, options: Any = None) -> Any:
-        """Begin an episode; the seed is that of the goal and of the start."""
-        self.seed(seed)
-        self.obstacles = []
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action: Any) -> Any:
-        """Take a step; the information has the coverage."""
-        observation, _, success, truncated, info = super().step(action)
-        return observation, 0.0, success, truncated, {**info, "coverage": self._calculate_coverage()}
-
-    @property
-    def within_reach(self) -> bool:
-        """True if a body at some pose inside the walls would cover enough of the goal."""
-        x, y, angle = self.goal_pose
-        body = shapely.unary_union([shapely.Polygon(shape.get_vertices()) for shape in self.block.shapes])
-
-        def at(angle: float, x: float, y: float) -> Any:
-            return affinity.translate(affinity.rotate(body, angle, origin=(0, 0), use_radians=True), x, y)
-
-        goal = at(angle, x, y)
-        for turn in np.linspace(-0.3, 0.3, 121):
-            pose = at(angle + turn, x, y)
-            low_x, low_y, high_x, high_y = pose.bounds  # moved inside by the shortest way
-            back = (max(LOW - low_x, 0) + min(HIGH - high_x, 0), max(LOW - low_y, 0) + min(HIGH - high_y, 0))
-            if affinity.translate(pose, *back).intersection(goal).area > self.success_threshold * goal.area:
-                return True
-        return False
-
-
-def pushing(body: Any) -> tuple[PlanarPushing, NDArray[np.float64]]:
-    """Make the system of a body of pymunk, about the centre of its area, and the place of this centre [length]."""
-    parts = [np.array(shape.get_vertices()) / PIXELS for shape in body.shapes]
-    center = Union(tuple(Polygon(torch.from_numpy(part)) for part in parts)).centroid
-    shape = Union(tuple(Polygon(torch.from_numpy(part) - center) for part in parts))
-    mass = torch.tensor(tuple(body.center_of_gravity), dtype=torch.float64) / PIXELS - center
-    gyration = (body.moment / body.mass) ** 0.5 / PIXELS
-    return tee_pushing(shape=shape, center_of_mass=mass, gyration=gyration, nearest=2), center.numpy()
-
-
-def count_turns(body: Any, center: NDArray[np.float64]) -> int:
-    """Count the turns of a body of pymunk about a centre [length] that cover it."""
-    whole = shapely.unary_union([shapely.Polygon(shape.get_vertices()) for shape in body.shapes])
-
-    def covered(n: int) -> float:
-        turned = affinity.rotate(whole, 360 / n, origin=tuple(PIXELS * center))
-        return turned.intersection(whole).area / whole.area
-
-    return max(n for n in range(1, 13) if covered(n) > ALIKE)
-
-
-class PushAnyPolicy(DiscPolicy):
-    """The policy for a shape of the environment, which it asks for the goal."""
-
-    def __init__(self, env: StateEnv, beyond: float = 0.0):
-        self.env = env
-        env.reset(seed=0)
-        system, center = pushing(env.block)
-        super().__init__(system, center, turns=count_turns(env.block, center), beyond=beyond / PIXELS)
-
-    def reset(self) -> None:
-        """Start an episode."""
-        super().reset()
-        self.goal = self.env.goal_pose
+from push_any import OBJECT_NAME_LIST, PushAnyPolicy, StateEnv
 
 
 @dataclass

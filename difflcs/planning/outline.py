@@ -1,5 +1,8 @@
 """Distances to a shape on a grid, and closed curves at a constant distance round it."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,22 +21,22 @@ def clearance(shape: Shape, points: Tensor) -> Tensor:
 
 
 class DistanceGrid:
-    """Signed distance to a shape on a grid of 161 × 161 points, interpolated between them: many points in little time.
+    """Signed distance to shapes on a grid of 161 × 161 points, interpolated between them: many points in little time.
 
     Args:
-        shape: in coordinates of its body.
-        reach: the grid goes this far beyond the shape [length], > 0. Points outside it get at most their distance.
+        distance: of points (..., 2) to what is there (...), such as `partial(clearance, shape)`.
+        reach: the grid goes so far from the origin [length], > 0. Points outside it get at most their distance.
 
     Attributes:
         axis: (161,) coordinates of the grid in x and in y.
         values: (161, 161) distances, the first index along x.
     """
 
-    def __init__(self, shape: Shape, reach: float):
-        half = 1.05 * (shape.radius + reach)
+    def __init__(self, distance: Callable[[Tensor], Tensor], reach: float):
+        half = 1.05 * reach
         with torch.no_grad():
             self.axis = torch.linspace(-half, half, _CELLS + 1, dtype=torch.float64)
-            self.values = clearance(shape, torch.stack(torch.meshgrid(self.axis, self.axis, indexing="ij"), -1))
+            self.values = distance(torch.stack(torch.meshgrid(self.axis, self.axis, indexing="ij"), -1))
 
     def distance(self, points: Tensor) -> Tensor:
         """Interpolate the signed distance (...) of points (..., 2) in coordinates of the body."""
@@ -68,7 +71,7 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
     distance = check_number("distance", distance, strict=True)
     n_points = check_positive_int("n_points", n_points, minimum=3)
     with torch.no_grad():
-        grid = DistanceGrid(shape, distance)
+        grid = DistanceGrid(partial(clearance, shape), shape.radius + distance)
         traced = _trace_loops((grid.values - distance).numpy(), grid.axis.numpy())
         curves = [torch.from_numpy(curve) for curve in traced]
         curve = max(curves, key=lambda curve: float(shoelace(curve).sum()))

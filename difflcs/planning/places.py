@@ -12,6 +12,7 @@ from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
+from difflcs.planning.obstacles import Obstacles
 from difflcs.planning.outline import clearance, ring
 
 
@@ -103,6 +104,7 @@ class DiscPlaces:
         reach: largest gap between disc and body at which pushing is considered [length]; None: the radius.
         workspace: region for places; None: everywhere.
         margin: between a place and the border of the workspace [length].
+        obstacles: in which, or nearer to which than the gap, there are no places; None: there are none.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -118,13 +120,14 @@ class DiscPlaces:
         reach: float | None = None,
         workspace: Workspace | None = None,
         margin: float = 0.0,
+        obstacles: Obstacles | None = None,
     ):
-        self.shape = shape
+        self.shape, self.obstacles = shape, obstacles
         self.radius = check_number("radius", radius, strict=True)
         self.reach = radius if reach is None else check_number("reach", reach)
         self.workspace, self.margin = workspace, check_number("margin", margin)
-        gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
-        self.ring = ring(shape, radius + gap, n_places)
+        self.gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
+        self.ring = ring(shape, radius + self.gap, n_places)
 
     def sample(self, x: Tensor) -> Tensor:
         """See `Places`: (n_places, 2) in coordinates of the body."""
@@ -140,9 +143,12 @@ class DiscPlaces:
 
     def allowed(self, states: Tensor) -> Tensor:
         """See `Places`."""
-        if self.workspace is None:
-            return torch.ones(len(states), dtype=torch.bool)
-        return self.workspace.contains(states[:, 3:5], self.margin)
+        allowed, discs = torch.ones(len(states), dtype=torch.bool), states[:, 3:5]
+        if self.workspace is not None:
+            allowed &= self.workspace.contains(discs, self.margin)
+        if self.obstacles is not None:
+            allowed &= self.obstacles.gap(discs) > self.radius + self.gap
+        return allowed
 
     def near(self, x: Tensor) -> bool:
         """See `Places`."""

@@ -29,16 +29,20 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_tensor, describe, make_plain
+from difflcs.constraints import LinearConstraints
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
 from difflcs.planning.places import Places
 from difflcs.planning.travel import Travel
+from difflcs.status import Status
 
 _IDLE = 3  # pushes in succession that have changed nothing, after which the robot looks for another place
 
 Bounds = Callable[[Tensor], tuple[Tensor, Tensor]]
 """States (n, n_x) → u_min and u_max (n, n_u), where the bounds of an action depend on the state."""
+Rows = Callable[[Tensor], LinearConstraints | None]
+"""States (n, n_x) → constraints of the plans from them, such as `Obstacles.constraints`; None for none."""
 
 
 class Mode(enum.StrEnum):
@@ -131,6 +135,7 @@ class SamplingPolicy:
         bounds: bounds of the actions at some states, instead of the layer's; `Workspace.bounds`, for example.
         angles: components of the goal that are angles [rad]; the state has each at the same index. Of all equivalent
             angles, the one nearest to the state is the goal.
+        constraints: of plans from some states, instead of the layer's; `Obstacles.constraints`, for example.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -145,6 +150,7 @@ class SamplingPolicy:
         *,
         bounds: Bounds | None = None,
         angles: Sequence[int] = (),
+        constraints: Rows | None = None,
     ):
         if not isinstance(mpc, LCSMPCLayer):
             raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; build one around your LCSModule")
@@ -154,7 +160,7 @@ class SamplingPolicy:
                 "the others"
             )
         self.mpc, self.places, self.travel, self.bounds = mpc, places, travel, bounds
-        self.settings = SamplingSettings() if settings is None else settings
+        self.settings, self.constraints = SamplingSettings() if settings is None else settings, constraints
         self.angles = list(angles)
         self.reset()
 
@@ -227,7 +233,8 @@ class SamplingPolicy:
         allowed[0] = True
         solution = self._solve(states, goal, context)
         gains, standing = _gains(solution)
-        gains = torch.where(allowed & solution.converged, gains, -math.inf)
+        usable = solution.converged | (solution.status == Status.MAX_ITER)  # which is a plan, too: it was executed
+        gains = torch.where(allowed & usable, gains, -math.inf)
         scale, settings = max(standing, 0.0), self.settings
         price = settings.switch_price + settings.travel_price * self.travel.distance(state, states[1:])
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
@@ -270,9 +277,10 @@ class SamplingPolicy:
 
     def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
         low, high = (None, None) if self.bounds is None else self.bounds(states)
+        rows = None if self.constraints is None else self.constraints(states)
         with warnings.catch_warnings():  # what was not solved is in the decision
             warnings.simplefilter("ignore", SolveWarning)
-            return self.mpc(states, goal, u_min=low, u_max=high, context=context)
+            return self.mpc(states, goal, u_min=low, u_max=high, constraints=rows, context=context)
 
 
 def _gains(solution: MPCSolution) -> tuple[Tensor, float]:

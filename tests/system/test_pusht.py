@@ -100,7 +100,8 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, 
 
 @pytest.mark.skipif(importlib.util.find_spec("gym_pushany") is None, reason="needs gym-pushany: pip install it")
 @pytest.mark.slow  # plays
-def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(board, capsys):
+def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(push_t, board, capsys):
+    import push_any
     import pushany
 
     pushany.main(pushany.Options(json=True, smoke=True, obstacles=2))
@@ -109,7 +110,7 @@ def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_
     for name, turns in shapes.items():
         env = pushany.StateEnv(object_name=name)
         env.reset(seed=0)
-        assert pushany.count_turns(env.block, pushany.pushing(env.block)[1]) == turns
+        assert push_any.count_turns(env.block, push_any.pushing(env.block)[1]) == turns
     seeds = pushany.find_seeds(pushany.Options(3, obstacles=2))
     for seed in seeds:
         env.reset(seed=seed)

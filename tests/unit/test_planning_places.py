@@ -145,7 +145,7 @@ def test_a_disc_gets_round_every_shape_without_touching_it(seed, name):
 
 
 def test_distances_on_a_grid_are_those_of_the_shape_but_for_a_part_of_its_cells():
-    grid = DistanceGrid(TEE, 0.3)
+    grid = DistanceGrid(functools.partial(clearance, TEE), TEE.radius + 0.3)
     points = 1.2 * (2 * torch.rand(2000, 2, dtype=F64, generator=torch.Generator().manual_seed(0)) - 1)
     assert float((grid.distance(points) - clearance(TEE, points)).abs().max()) < 0.3 * 2.6 / 160
     assert float(grid.distance(tensor([50.0, 0.0]))) <= 50.0 - 0.6
