@@ -355,7 +355,7 @@ def objects(record: dict) -> str:
     return table(head, rows)
 
 
-METHODS = {"contact-lcs": "ContactLCS", "lcs-rl": "LCS-RL", "pddm": "PDDM"}
+METHODS = {"contact-lcs": "ContactLCS", "frame-lcs": "LCS in the body's frame", "lcs-rl": "LCS-RL", "pddm": "PDDM"}
 
 
 def largest(record: dict, task: str, method: str) -> list[dict]:
@@ -370,13 +370,14 @@ def methods(record: dict) -> str:
     minutes = sorted({row["minutes"] for row in record["rows"] if row["task"] == "cube"})
     rows = []
     for method, label in METHODS.items():
-        own, cells = largest(record, "cube", method), []
+        own, cells, seeds = largest(record, "cube", method), [], set()
         for minute in minutes:
             rates = {row["seed"]: 100 * row["success_rate"] for row in own if row["minutes"] == minute}
             cells.append(f"{sum(rates.values()) / len(rates):.1f} ({min(rates.values()):.1f})" if rates else "")
-        seeds = len({row["seed"] for row in own})
+            seeds |= {len(rates)} - {0}
         if own:
-            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{seeds} × {own[0]['goals']}"])
+            count = " or ".join(map(str, sorted(seeds)))
+            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{count} × {own[0]['goals']}"])
     return table(["", "told", *(f"{m:g} min" for m in minutes), "seeds × goals"], rows)
 
 

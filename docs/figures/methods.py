@@ -31,6 +31,7 @@ Points = dict[float, list[float]]
 OBJECTS = ("cube", "sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
 STYLES = {
     "contact-lcs": ("ContactLCS, told the outline", "#cc79a7"),
+    "frame-lcs": ("LCS in the body's frame, told the plane", "#56b4e9"),
     "lcs-rl": ("LCS-RL, told nothing", "#d55e00"),
     "pddm": ("PDDM (networks), told nothing", "#009e73"),
     "violation": ("violation loss only, told nothing", "#0072b2"),
@@ -86,7 +87,7 @@ def draw_minutes(axes: Axes) -> None:
 
 def draw_objects(axes: Axes) -> None:
     """The last evaluation on every object; that of ContactLCS after three minutes."""
-    for k, method in enumerate(m for m in STYLES if m != "pddm"):
+    for k, method in enumerate(m for m in STYLES if m not in ("pddm", "frame-lcs")):
         _, color = STYLES[method]
         for y, task in enumerate(OBJECTS):
             points = points_of(task, method)
