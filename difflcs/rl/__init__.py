@@ -12,11 +12,11 @@ require("gymnasium")  # a clear error, before the modules below import it
 # ruff: noqa: E402
 from difflcs.rl.learning.critic import CriticSettings
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
+from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.model_rollouts import ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.optim import Natural, NaturalGradient
 from difflcs.rl.learning.pddm import PDDM, PDDMSettings
-from difflcs.rl.learning.phases import LCSRL
 from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitSettings
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.learning.ppo_settings import PPOSettings, make_ppo

@@ -270,7 +270,7 @@ def append_episodes(known: TensorDict, episodes: TensorDict, keep: int | None = 
 
 
 def episodes_to_state(episodes: TensorDict) -> dict[str, Tensor]:
-    """Return a record of `TRANSITIONS` as a part of a state, see `difflcs.rl.learning.state`."""
+    """Return a record of `TRANSITIONS` as a part of a state, see `difflcs.rl.learning.state_tree`."""
     return {name: episodes[name] for name in _stored_keys(episodes)}
 
 

@@ -16,7 +16,7 @@ import torch
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.learning.ppo import PPOReport
-from difflcs.rl.learning.state import copy_state, flatten, unflatten
+from difflcs.rl.learning.state_tree import copy_state, flatten, unflatten
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods import FrameMethod, Method, MujocoMethod, Work, get_method, method_names, register_method
 from difflcs.rl.runs import training
@@ -253,7 +253,7 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
 
 
 def test_states_with_anything_wrong_are_refused_and_change_nothing(name, make_trainer):
-    """What `check_state` refuses: tests/unit/test_state.py."""
+    """What `check_state` refuses: tests/unit/test_state_tree.py."""
     trainer = make_trainer(name)
     trainer.step()
     before = copy_state(trainer.state_dict())

@@ -15,7 +15,7 @@ from difflcs import LCSModel, _storage, zoo
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.learning.state import check_state
+from difflcs.rl.learning.state_tree import check_state
 from difflcs.rl.learning.trainer import save_learned
 from difflcs.rl.methods import method_names
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint

@@ -4,7 +4,7 @@ from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.policy import make_actor
 from difflcs.rl.learning.ppo import PPO
-from difflcs.rl.learning.state import copy_state
+from difflcs.rl.learning.state_tree import copy_state
 from tests.training.slide import (
     PENALTY,
     ROLLOUTS,

@@ -16,7 +16,7 @@ import torch
 
 from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
-from difflcs.rl.learning.state import flatten
+from difflcs.rl.learning.state_tree import flatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 
 

@@ -128,7 +128,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(kind, bad):
 
 
 def _tensors(state) -> list[torch.Tensor]:
-    from difflcs.rl.learning.state import flatten
+    from difflcs.rl.learning.state_tree import flatten
 
     return list(flatten(state)[0].values())
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.advantages import GAE, gae, returns
 from difflcs.rl.learning.least_squares import FlatAdam, gradients, tanh
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.seeding import seeded
 from difflcs.rl.settings import MOST_WIDTH, Epochs, Settings, bounded, group
 

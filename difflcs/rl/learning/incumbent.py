@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from difflcs.rl.learning.state import State, copy_state
+from difflcs.rl.learning.state_tree import State, copy_state
 from difflcs.rl.learning.trainer import TrainableModel
 from difflcs.rl.rollout import Policy
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 
 Layer = tuple[Tensor, Tensor]
 """Weights (K, n_in, n_out) and biases (K, 1, n_out) of one layer of K networks."""

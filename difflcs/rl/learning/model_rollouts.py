@@ -20,7 +20,7 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.rollout import (
     CONTEXT,
     append_context,

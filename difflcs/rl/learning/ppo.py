@@ -24,7 +24,7 @@ from difflcs.rl.learning.critic import Critic
 from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions

@@ -14,7 +14,7 @@ from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state, untouched
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
-from difflcs.rl.learning.state import State, restore
+from difflcs.rl.learning.state_tree import State, restore
 from difflcs.rl.rollout import Act, Policy, collect, episodes_from_state, episodes_to_state, make_empty_record
 from difflcs.rl.seeding import Stream, episode_seeds
 

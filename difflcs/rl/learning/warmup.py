@@ -14,7 +14,7 @@ from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
 from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
 from difflcs.rl.rollout import (
     Policy,

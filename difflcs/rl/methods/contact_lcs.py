@@ -13,8 +13,8 @@ from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import get_backend
 from difflcs.records import LCSModule
+from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
-from difflcs.rl.learning.phases import LCSRL
 from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitReport, PhysicsFitSettings
 from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from difflcs.errors import InvalidInputError
+from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
-from difflcs.rl.learning.phases import LCSRL
 from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.learning.trainer import Trainer

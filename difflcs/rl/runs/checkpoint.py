@@ -30,7 +30,7 @@ from torch import Tensor
 
 from difflcs import _storage
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.state import State, flatten, unflatten
+from difflcs.rl.learning.state_tree import State, flatten, unflatten
 
 _KIND = "training"
 _DIGITS = 12

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.settings import Settings, bounded
 
 _MEMORY = 0.7

@@ -17,7 +17,7 @@ from torch import nn
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.checks import check_depends, check_learned
 from difflcs.rl.learning.optim.natural import DAMPING, Natural, NaturalGradient
-from difflcs.rl.learning.state import State, initialise_moments, load_moments, moments
+from difflcs.rl.learning.state_tree import State, initialise_moments, load_moments, moments
 from difflcs.rl.settings import Adam
 
 if TYPE_CHECKING:

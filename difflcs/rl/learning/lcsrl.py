@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from difflcs._checks import check_choice, check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl.learning.state import State
+from difflcs.rl.learning.state_tree import State
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.state import check_state, copy_state, flatten, restore, unflatten
+from difflcs.rl.learning.state_tree import check_state, copy_state, flatten, restore, unflatten
 
 NAMES = st.text("abcxyz_.0 é", min_size=1, max_size=5)
 NUMBERS = st.integers(-(2**200), 2**200) | st.floats(allow_nan=False) | st.booleans() | st.none() | st.text(max_size=5)
