@@ -161,6 +161,7 @@ class HandPolicy:
         s = settings
         self.twin, self.seconds, model = copy.copy(model), s.seconds, copy.copy(model)
         self.twin.opt.timestep, self.twin.opt.cone = s.step, mujoco.mjtCone.mjCONE_PYRAMIDAL
+        self.twin.opt.impratio = 1.0
         self.tried, self.rollout = mujoco.MjData(self.twin), rollout.Rollout(nthread=0)
         model.body_inertia[model.body("cube").id] *= s.inertia
         self.module = MujocoLCS(
@@ -176,6 +177,7 @@ class HandPolicy:
             distance=0.03,
             compliance=s.compliance,
             length=0.02,
+            limits=0,  # actions are within them already
         )
         cost = [
             Position("body:cube", s.place, weight=0.0, weight_final=s.place_weight),

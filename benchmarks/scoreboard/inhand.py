@@ -63,6 +63,8 @@ JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
 COLUMNS = "object", "seed", "success", "placed", "dropped", "steps", "position_mm", "angle_deg", "goals"
 PARTS = "plan", "rehearsal"
+LONG = 0.12  # length from which on an object does not turn on the palm without touching the base of the thumb [m]
+ASIDE = (0.01, -0.01, 0.0), (0.03, 0.03, 0.02)  # from its place to where it can
 LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS, OPENING = 500, 21, 50, 0.005, 0.1, 20, 8
 
 
@@ -87,6 +89,8 @@ class Settings:
     effort: float = 0.2
     patience: int = 25
     """Decisions without progress after which the hand opens, and takes the object anew."""
+    turned: float = 0.6
+    """Angle from which on the object is drawn to its place again after an opening [rad]."""
     pace: float = 0.5
     """Part of the published limit of actions that is used, as drops come from fast motion."""
     paces: tuple[float, ...] = (2.0, 0.7)
@@ -203,7 +207,7 @@ class HandPolicy:
 
     def aim(self, goal: np.ndarray) -> None:
         """Turn the object to this quaternion from now on."""
-        self.goal, self.best, self.waited = goal, np.inf, 0
+        self.goal, self.aimed, self.best, self.waited = goal, self.place, np.inf, 0
 
     def angle(self, data: Any) -> float:
         """Angle by which the object is still to be turned [rad]."""
@@ -211,14 +215,17 @@ class HandPolicy:
 
     def stalls(self, data: Any) -> bool:
         """Tell whether the object has not come nearer for too long: then the hand opens for some decisions."""
-        left = self.angle(data) + 20 * float(np.linalg.norm(data.qpos[-7:-4] - self.place))
+        left = self.angle(data) + 20 * float(np.linalg.norm(data.qpos[-7:-4] - self.aimed))
         self.waited += 1
         if self.waited > 0 and left < max(self.best - 0.05, 0.5):  # by 3° or 2.5 mm, or it is almost there
             self.best, self.waited = min(left, self.best), 0
         if self.waited > self.settings.patience:
             self.best, self.waited = np.inf, -OPENING
             self.posture = self.draw(0.0 if self.posture is None else 0.3)
-            self.spots = self.random.uniform(-1, 1, (4, 3)) * self.twin.geom_aabb[self.geom, 3:]
+            size = self.twin.geom_aabb[self.geom, 3:]
+            if max(size) > LONG / 2:
+                self.aimed = self.place + self.random.uniform(*ASIDE)
+            self.spots = self.random.uniform(-1, 1, (4, 3)) * size
         return self.waited < 0
 
     def draw(self, spread: float) -> np.ndarray:
@@ -235,20 +242,39 @@ class HandPolicy:
             return ctrl
         marks = [time.thread_time()]
         grips = data.geom_xpos[self.geom] + self.spots @ data.geom_xmat[self.geom].reshape(3, 3).T
-        goal = np.concatenate([self.place, self.goal, *grips])
-        action = self.mpc.step(self.module.observe(data), goal)  # which asks module and cost
+        x, bounds = self.module.observe(data), {}
+        if self.aimed is not self.place and self.angle(data) < self.settings.turned:
+            self.aim(self.goal)
+        if self.aimed is not self.place:
+            bounds = self.lay_flat(data, x)
+        goal = np.concatenate([self.aimed, self.goal, *grips])
+        action = self.mpc.step(x, goal, **bounds)  # which asks module and cost
         marks.append(time.thread_time())
         ctrl = self.rehearse(data, action, self.settings.paces)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         return ctrl
 
+    def lay_flat(self, data: Any, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Bounds of the actions by which the finger lies down into which the end of the object turns."""
+        turn, far = np.zeros(4), self.settings.pace * self.limit
+        mujoco.mju_mulQuat(turn, self.goal, data.qpos[-4:] * [1, -1, -1, -1])
+        finger = slice(8, 12) if turn[0] * turn[3] > 0 else slice(0, 4)
+        low, high = (bound.clamp(-far, far) for bound in self.module.action_bounds(x))
+        move = torch.from_numpy(-data.qpos[finger]).clamp(low[finger], high[finger])
+        low[finger], high[finger] = move - 1e-3, move + 1e-3
+        return {"u_min": low, "u_max": high}
+
     def rehearse(self, data: Any, action: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
-        """Try a step at several paces in MuJoCo: the fastest that ends about as well as the best, or none."""
+        """Try a step at two paces in MuJoCo: the faster if it ends about as well as the slower, or none.
+
+        Where the faster ends worse, but does no great harm, the slower is executed untried: it mostly ends better.
+        """
         s, now, tries, ends = self.settings, self.miss(data), [], []
         for pace in paces or (1.0,):
             tries.append(data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit))
-            ends.append(self.simulate(data, tries[-1]) if s.paces else now)
+            safe = not s.paces or (ends != [] and now + s.slack < ends[-1] < now + s.worse)
+            ends.append(now if safe else self.simulate(data, tries[-1]))
             if ends[-1] < now - s.gain:
                 break
         if min(ends) > now + s.worse:
@@ -267,7 +293,7 @@ class HandPolicy:
     def miss(self, data: Any) -> float:
         """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""
         s, left = self.settings, self.angle(data)
-        apart, near = data.qpos[-7:-4] + SECONDS * data.qvel[-6:-3] - self.place, min(left, s.reach)
+        apart, near = data.qpos[-7:-4] + SECONDS * data.qvel[-6:-3] - self.aimed, min(left, s.reach)
         return s.place * apart @ apart + s.turn * near * (2 * left - near)
 
 

@@ -270,7 +270,8 @@ class MujocoCost(TensorFields):
                 wanted = _rotation_between(of, turns[..., row.where[0], :], wanted, row.reach)
             parts.append(wanted)
         shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return of.concatenate([of.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], -1)
+        fits = [p if p.shape[:-1] == shape else of.broadcast_to(p, (*shape, p.shape[-1])) for p in parts]
+        return of.concatenate(fits, -1)
 
 
 def _rotation_between(of: Any, here: Any, goal: Any, reach: float) -> Any:

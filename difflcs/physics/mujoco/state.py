@@ -89,6 +89,8 @@ class MujocoState:
     def _references(self, batch: tuple[int, ...]) -> Array:
         """Return the reference of each state (*batch, nq)."""
         own = self._reference.shape[:-1]
+        if batch == own:
+            return self._reference
         if batch[: len(own)] != own:
             raise ShapeError(
                 f"x: expected states with the first batch dimensions {own} of the reference of their rotations, got "
@@ -123,8 +125,9 @@ class MujocoState:
         x[..., self._of_state] = qpos[..., self._of_qpos]
         reference = self._references(qpos.shape[:-1]) if self._turning else qpos
         for q, v in self._turning:
-            turn = _multiply(_conjugate(reference[..., q : q + 4]), _unit(qpos[..., q : q + 4]))
-            x[..., v : v + 3] = _rotation_vector(turn)
+            there, here = reference[..., q : q + 4], _unit(qpos[..., q : q + 4])
+            if (there != here).any():  # something has turned
+                x[..., v : v + 3] = _rotation_vector(_multiply(_conjugate(there), here))
         if self.velocities:
             shape = x.shape[:-1]
             for name, values, size in (("qvel", qvel, self.nv), ("act", act, self.na)):
