@@ -620,7 +620,6 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     ("main", "arguments", "message"),
     [
         (table1.main, ["--rerun", "--preset", "papers"], "invalid choice 'papers'"),
-        (table1.main, ["--preset", "papers"], "invalid choice 'papers'"),
         (table1.main, ["--rerun", "--objects", "teapot"], "invalid choice 'teapot'"),
         (run_runs, ["--methods", "sac"], "invalid choice 'sac'"),
         (run_runs, ["--artefacts", "table2"], "invalid choice 'table2'"),
