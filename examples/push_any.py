@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 import torch
 from body_paths import BodyPaths
+from learn_push import learn
 from numpy.typing import NDArray
 from push_t import PIXELS, RADIUS, SIDE, DiscPolicy, Rigid, tee_pushing
 from shapely import affinity
@@ -66,6 +67,21 @@ class StateEnv(PushAnyEnv):
         """Take a step; the information has the coverage."""
         observation, _, success, truncated, info = super().step(action)
         return observation, 0.0, success, truncated, {**info, "coverage": self._calculate_coverage()}
+
+    @property
+    def others(self) -> Array:
+        """(n, 2) places of the bodies in the way [px]."""
+        return np.array([body.position for body in self.obstacles]).reshape(-1, 2)
+
+    def settled(self, seed: int) -> Array:
+        """Return the places (n, 2) of the bodies in the way after three seconds in which the disc stays where it is.
+
+        Bodies that overlap at the start are pushed apart.
+        """
+        self.reset(seed=seed)
+        for _ in range(30):
+            self.step(np.array(self.agent.position))
+        return self.others
 
     @property
     def within_reach(self) -> bool:
@@ -132,6 +148,7 @@ class PushAnyPolicy(DiscPolicy):
     Args:
         env: the environment.
         beyond: how far the disc may go beyond the square [px].
+        learned: plan with the system that two minutes of random pushing teach, instead of the true one.
     """
 
     MARGIN, PRICE = 0.05, 100.0
@@ -142,10 +159,13 @@ class PushAnyPolicy(DiscPolicy):
     """Pushes in succession without a gain, or steps in which the body comes no nearer, after which obstacles are
     ignored for so many steps."""
 
-    def __init__(self, env: StateEnv, beyond: float = 0.0):
+    def __init__(self, env: StateEnv, beyond: float = 0.0, *, learned: bool = False):
         self.env = env
         env.reset(seed=0)
         system, center = pushing(env.block)
+        if learned:
+            alone = StateEnv(object_name=env.object_name, use_obstacles=False)
+            system = learn(alone, 0, true=system, center=center).physics
         assert isinstance(system.shape, Union)
         self._corners = torch.cat([part.vertices for part in system.shape.parts if isinstance(part, Polygon)])
         self._paths = BodyPaths(self._gap, SIDE, self.ROOM)

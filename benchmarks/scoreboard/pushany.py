@@ -3,7 +3,7 @@
 The environment (gym-pushany 0.1.13, after Push-T) is as its author publishes it: 21 shapes, its own starts, goals and
 success flag (more than 95 % of the goal covered), 300 steps of 0.1 s, and up to four other bodies in the way, which can
 be pushed, too. Only its pictures are not drawn. The policy is that of examples/push_t.py, with the outline, mass and
-moment of the body, the goal and the true state. It is not told what is in the way.
+moment of the body, the goal, the true state, and the outlines of the bodies in the way, which it goes round.
 
 Walls stop the body, not the disc, which is kinematic: it may go `--beyond` them, to push a body away from a wall.
 
@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
 from pusht import STEPS, Episode, Variant, play
 from successes import success_figures, success_text
 
@@ -30,6 +31,8 @@ from difflcs.errors import InvalidInputError
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 from push_any import OBJECT_NAME_LIST, PushAnyPolicy, StateEnv
+
+MOVED = 5  # px, from which on a body in the way counts as displaced
 
 
 @dataclass
@@ -44,6 +47,8 @@ class Options:
     """Bodies in the way, 0 to 4."""
     beyond: float = 40.0
     """How far the disc may go beyond the square of 512 px [px]."""
+    learned: bool = False
+    """Plan with what two minutes of random pushing teach about each shape."""
     shape: str = "all"
     """One of the shapes, or "all"."""
     json: bool = False
@@ -59,22 +64,33 @@ def find_seeds(o: Options) -> list[int]:
 
 
 class Played(NamedTuple):
-    """An episode, and whether its goal is within reach."""
+    """An episode, whether its goal is within reach, and how far (n,) the bodies in the way were displaced [px]."""
 
     episode: Episode
     within_reach: bool
+    displaced: NDArray[np.float64]
+
+
+def play_seed(env: StateEnv, policy: PushAnyPolicy, seed: int, limit: int) -> Played:
+    """Play an episode; what moves because bodies overlap at the start does not count as displaced."""
+    settled = env.settled(seed)
+    episode = play(env, policy, seed, Variant(), limit)
+    return Played(episode, env.within_reach, np.linalg.norm(env.others - settled, axis=1))
 
 
 def figures(played: list[Played]) -> dict[str, Any]:
     """Compute the figures of episodes."""
     success, steps, _, milliseconds, _ = np.array([one.episode for one in played], float).T
     reached = [one.episode.success for one in played if one.within_reach]
+    displaced = np.concatenate([one.displaced for one in played])
     return {
         **success_figures(success),
         "mean_steps": float(steps.mean()),
         "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
         "within_reach": float(np.mean(reached)) if reached else None,
         "goals_within_reach": len(reached),
+        "mean_displaced": float(displaced.mean()) if len(displaced) else 0.0,
+        "displaced": float((displaced > MOVED).mean()) if len(displaced) else 0.0,
     }
 
 
@@ -90,8 +106,8 @@ def main(o: Options) -> None:
     everything: list[Played] = []
     for name in names:
         env = StateEnv(object_name=name)
-        policy, limit = PushAnyPolicy(env, o.beyond), 5 if o.smoke else STEPS
-        played = [Played(play(env, policy, seed, Variant(), limit), env.within_reach) for seed in find_seeds(o)]
+        policy, limit = PushAnyPolicy(env, o.beyond, learned=o.learned), 5 if o.smoke else STEPS
+        played = [play_seed(env, policy, seed, limit) for seed in find_seeds(o)]
         everything += played
         if not o.json:
             report(name, figures(played))
@@ -105,6 +121,7 @@ def report(name: str, f: dict[str, Any]) -> None:
     """Print the figures of a shape."""
     reached, of = f["within_reach"], f["goals_within_reach"]
     within = "" if reached is None else f", {100 * reached:.1f} % of {of} within reach"
+    within += f", others displaced by {f['mean_displaced']:.1f} px, {100 * f['displaced']:.0f} % of them"
     print(
         f"{name}: {success_text(f)}{within}; {f['mean_steps']:.1f} steps, {f['milliseconds_per_step']:.1f} ms a step",
         flush=True,

@@ -5,7 +5,7 @@ and limit (300 steps of 0.1 s). The policy of examples/push_t.py is given the st
 and, by variant:
 
 - known: geometry, mass and drive as they are;
-- learned: what is learned from two minutes of random pushing, see `learn_pusht.py`;
+- learned: what is learned from two minutes of random pushing, see `examples/learn_push.py`;
 - inertia, friction, outline: one of them wrong by 20 %, the outline also by 10 % (friction, which is zero, is taken for
   0.2); centre of mass: off by 12 px, a fifth of half the T's width;
 - drive: stiffness wrong by 20 %; rough: disc and T have a friction of 0.5, and it is told 0;
@@ -18,6 +18,7 @@ again: after a change of the policy begin another file. `--variant all` plays al
 """
 
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -27,12 +28,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import tyro
-from learn_pusht import learn
-from push_t import CENTER_OF_MASS, DRIVE, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from successes import success_figures, success_text
 
 from difflcs.cli.bench import machine, save
 from difflcs.errors import InvalidInputError
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
+from learn_push import learn
+from push_t import CENTER_OF_MASS, DRIVE, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 
 
 @dataclass(frozen=True)

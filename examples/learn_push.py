@@ -1,25 +1,22 @@
-"""Push-T learned from two minutes of random pushing: `python benchmarks/scoreboard/learn_pusht.py --seed 0`.
+"""Push-T learned from two minutes of random pushing: `python examples/learn_push.py --seed 0`.
 
-The disc is sent to random places near the T of gym-pusht, 1200 steps of 0.1 s. Nothing is asked of the pushing: no
-goal, no reward, no demonstration. A `ContactLCS` that begins with a wrong centre of mass, inertia, friction, compliance
-and outline is fitted to the transitions by the violation loss.
+The disc is sent to random places near the body, 1200 steps of 0.1 s. Nothing is asked of the pushing: no goal, no
+reward, no demonstration. A `ContactLCS` that begins with a wrong centre of mass, inertia, friction, compliance and
+outline is fitted to the transitions by the violation loss. `--shape 4` learns one of the shapes of gym-pushany.
 """
 
-import sys
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
+from push_t import _CENTER, PIXELS, from_origin, make_env, tee_pushing
 from torch import Tensor
 
 from difflcs import violation_loss
 from difflcs.physics import ContactLCS, PlanarPushing, Polygon, Union
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
-from push_t import CENTER_OF_MASS, GYRATION, PIXELS, from_origin, make_env, tee, tee_pushing
 
 LEARNED = ("center_of_mass", "gyration", "friction", "compliance", "outline")
 RATE, XI, KEPT = 0.03, 0.1, 0.8
@@ -35,30 +32,31 @@ class Transitions(NamedTuple):
     x_next: Tensor
 
 
-def random_pushing(env: Any, steps: int, seed: int) -> Transitions:
-    """Collect pushes: the disc goes to random places within 90 px of the T's middle, at most 30 px ahead."""
+def random_pushing(env: Any, center: NDArray[np.float64], steps: int, seed: int) -> Transitions:
+    """Collect pushes: the disc goes to random places within 90 px of the body's middle, at most 30 px ahead."""
     rng = np.random.default_rng([seed, 1])
     x, u, x_next = [], [], []
     for step in range(steps):
         if step % EPISODE == 0:
             _, info = env.reset(seed=1_000_000 + 1000 * seed + step)
         if step % HOLD == 0:
-            place = from_origin(info["block_pose"])[:2] * PIXELS + rng.uniform(-90, 90, 2)
+            place = from_origin(info["block_pose"], center)[:2] * PIXELS + rng.uniform(-90, 90, 2)
         way = place - info["pos_agent"]
         target = np.clip(info["pos_agent"] + way * min(1.0, 30.0 / np.linalg.norm(way)), 0.0, 512.0)
-        x.append(state(info))
+        x.append(state(info, center))
         u.append((target - info["pos_agent"]) / PIXELS)
         *_, info = env.step(target)
-        x_next.append(state(info))
+        x_next.append(state(info, center))
     return Transitions(*(torch.from_numpy(np.array(rows)) for rows in (x, u, x_next)))
 
 
-def state(info: dict[str, np.ndarray]) -> np.ndarray:
+def state(info: dict[str, NDArray[np.float64]], center: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the state (7,) from the environment's information."""
-    return np.concatenate([from_origin(info["block_pose"]), info["pos_agent"] / PIXELS, info["vel_agent"] / PIXELS])
+    pose = from_origin(info["block_pose"], center)
+    return np.concatenate([pose, info["pos_agent"] / PIXELS, info["vel_agent"] / PIXELS])
 
 
-def guess(seed: int) -> ContactLCS:
+def guess(true: PlanarPushing, seed: int) -> ContactLCS:
     """Make the start of learning: everything that is learned is wrong.
 
     The centre of mass is 20 px off in a random direction, the radius of gyration a third too large, friction 0.3 where
@@ -66,9 +64,12 @@ def guess(seed: int) -> ContactLCS:
     """
     rng = np.random.default_rng([seed, 3])
     angle = rng.uniform(0, 2 * np.pi)
-    center = np.array(CENTER_OF_MASS) + 0.2 * np.array([np.cos(angle), np.sin(angle)])
-    physics = tee_pushing(
-        center_of_mass=center.tolist(), gyration=GYRATION * 4 / 3, friction=torch.tensor([0.3]).double(), compliance=0.1
+    center = torch.as_tensor(true.center_of_mass) + 0.2 * torch.tensor([np.cos(angle), np.sin(angle)])
+    physics = true.replace(
+        center_of_mass=center,
+        gyration=torch.as_tensor(true.gyration) * 4 / 3,
+        friction=torch.tensor([0.3]).double(),
+        compliance=0.1,
     )
     model = ContactLCS(physics, learn=("outline",))
     with torch.no_grad():
@@ -92,7 +93,7 @@ class Learned(NamedTuple):
     Attributes:
         physics: the system; without friction if without it the loss is at most 2 % larger.
         values: of each parameter.
-        corners: how far each corner is from where it is [px].
+        corners: how far each corner is from where it is [px], without those that touch another part.
         loss: of the transitions that count.
         seconds: CPU time of learning.
     """
@@ -105,7 +106,7 @@ class Learned(NamedTuple):
 
 
 def trimmed(model: ContactLCS | PlanarPushing, data: Transitions) -> Tensor:
-    """Compute the mean violation loss without the largest fifth: T at a wall, disc inside the T at the start."""
+    """Compute the mean violation loss without the largest fifth: body at a wall, disc inside it at the start."""
     each = violation_loss(model, *data, gamma="auto", xi=XI, reduction="none")
     return each.sort().values[: int(KEPT * len(each))].mean()
 
@@ -121,11 +122,29 @@ def fit(model: ContactLCS, data: Transitions, iterations: int) -> None:
         schedule.step()
 
 
-def learn(env: Any, seed: int, steps: int = 1200, iterations: int = 300) -> Learned:
-    """Learn a system from wrong values by random pushing."""
-    data = random_pushing(env, steps, seed)
+def learn(
+    env: Any,
+    seed: int,
+    steps: int = 1200,
+    iterations: int = 300,
+    *,
+    true: PlanarPushing | None = None,
+    center: NDArray[np.float64] | None = None,
+) -> Learned:
+    """Learn a system from wrong values by random pushing.
+
+    Args:
+        env: gym-pusht's environment, or `push_any.StateEnv`.
+        seed: of the pushing and of the wrong values.
+        steps: of pushing.
+        iterations: of the fit.
+        true: the system as it is, from which the wrong values begin; `tee_pushing()` by default.
+        center: (2,) centre of its area, from the origin whose pose is observed; None: that of the T.
+    """
+    true = tee_pushing() if true is None else true
+    data = random_pushing(env, _CENTER.numpy() if center is None else center, steps, seed)
     start = time.process_time()
-    model = guess(seed)
+    model = guess(true, seed)
     before, first = model.summary(), frozen(model.physics)
     fit(model, data, iterations)
     physics, after = frozen(model.physics), model.summary()
@@ -136,34 +155,46 @@ def learn(env: Any, seed: int, steps: int = 1200, iterations: int = 300) -> Lear
         if float(trimmed(smooth, data)) <= 1.02 * loss[1]:
             physics, after = frozen(smooth.physics), {**smooth.summary(), "friction": [0.0]}
     spent = time.process_time() - start
-    return Learned(physics, (before, after), (corners(first), corners(physics)), loss, spent)
+    return Learned(physics, (before, after), (corners(first, true), corners(physics, true)), loss, spent)
 
 
-def corners(physics: PlanarPushing) -> list[float]:
-    """Compute each corner's distance to its true place [px], without the two inside the bar, which nothing touches."""
-    learned, true = (
-        torch.cat([part.vertices for part in shape.parts if isinstance(part, Polygon)])
-        for shape in (physics.shape, tee())
-        if isinstance(shape, Union)
-    )
-    outside = [0, 1, 2, 3, 6, 7]
-    return (PIXELS * (learned - true)[outside]).norm(dim=1).tolist()
+def corners(physics: PlanarPushing, true: PlanarPushing) -> list[float]:
+    """Compute each corner's distance to its true place [px], without those that touch another part."""
+    apart = []
+    assert isinstance(physics.shape, Union)
+    assert isinstance(true.shape, Union)
+    for i, (learned, part) in enumerate(zip(physics.shape.parts, true.shape.parts, strict=True)):
+        assert isinstance(learned, Polygon)
+        assert isinstance(part, Polygon)
+        others = [other.distance(part.vertices).distance.amin(-1) for j, other in enumerate(true.shape.parts) if j != i]
+        outside = torch.stack([*others, torch.ones(len(part.vertices)).double()]).amin(0) > 1e-6
+        apart.append(PIXELS * (learned.vertices - part.vertices)[outside].norm(dim=1))
+    return torch.cat(apart).tolist()
 
 
-def main(seed: int = 0) -> None:
-    """Learn Push-T from random pushing, and print.
+def main(seed: int = 0, shape: str | None = None) -> None:
+    """Learn from random pushing, and print.
 
     Args:
         seed: of the pushing and of the wrong values.
+        shape: of gym-pushany; None: the T of gym-pusht.
     """
     torch.set_num_threads(1)
-    result = learn(make_env(), seed)
+    if shape is None:
+        true, result = tee_pushing(), learn(make_env(), seed)
+    else:
+        from push_any import StateEnv, pushing
+
+        env = StateEnv(object_name=shape, use_obstacles=False)
+        env.reset(seed=0)
+        true, center = pushing(env.block)
+        result = learn(env, seed, true=true, center=center)
     print(f"{result.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
     print(f"violation loss {result.loss[0]:.2e} before, {result.loss[1]:.2e} after")
-    true = {"center_of_mass": list(CENTER_OF_MASS), "gyration": GYRATION, "friction": [0.0]}
+    right = {name: torch.as_tensor(getattr(true, name)).tolist() for name in ("center_of_mass", "gyration", "friction")}
     for name in ("center_of_mass", "gyration", "friction", "compliance"):
         before, after = (values[name] for values in result.values)
-        print(f"{name}: {before} before, {after} after, true {true.get(name, '—')}")
+        print(f"{name}: {before} before, {after} after, true {right.get(name, '—')}")
     for when, apart in zip(("before", "after"), result.corners, strict=True):
         print(f"corners off by {', '.join(f'{v:.1f}' for v in apart)} px {when}")
 
