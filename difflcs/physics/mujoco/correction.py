@@ -165,12 +165,12 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
     if wrong.any():
         worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)
         dof = int(np.argmax(np.abs(off[worst] * (mass[worst[1]] @ off[worst]))))
-        joint = model.joint(model.dof_jntid[dof])
+        joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
         warnings.warn(
             f"expected a system as near to MuJoCo's own step as standing still is, also at the ends of the ranges of "
             f"its actions and half way there, got one that is farther off with such an action in {wrong.sum()} of "
-            f"{len(wrong)} states, most of all joint {joint.name or joint.id!r}: take fewer seconds, or a nominal "
-            f"control (ctrl) near the actions",
+            f"{len(wrong)} states, most of all joint {joint.name or joint.id!r} of body {body.name or body.id!r}: take "
+            f"fewer seconds, or a nominal control (ctrl) near the actions",
             ContactWarning,
             stacklevel=4,
         )

@@ -62,10 +62,11 @@ class QuasiStatic:
             raise InvalidInputError(
                 'model: expected actuators on what is moved, got none; add <position joint="..."/> for each joint'
             )
-        if (actuators.dof < 0).any() or len(set(actuators.dof)) < model.nu:
+        others = [i for i, dof in enumerate(actuators.dof) if dof < 0 or (actuators.dof == dof).sum() > 1]
+        if others:
             raise InvalidInputError(
-                "model: expected each actuator on a slide or hinge of its own for quasi-static motion, got others; "
-                'change them, or use motion="dynamic"'
+                "model: expected each actuator on a slide or hinge of its own for quasi-static motion, got others "
+                f'(numbers {others}); change them, or use motion="quasi-dynamic" or "dynamic"'
             )
         self.model = model
         self.pushed = np.setdiff1d(np.arange(model.nv), actuators.dof)
