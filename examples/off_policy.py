@@ -35,11 +35,11 @@ from difflcs import cli
 from difflcs.errors import InvalidInputError
 from difflcs.rl import LCSMethod, LCSMPCPolicy, Trainer, bounded, collect, register_method
 from difflcs.rl.learning.advantages import RewardScale
+from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.model_rollouts import ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.optim import Natural, NaturalUpdate
 from difflcs.rl.learning.optim.update import Deviation
-from difflcs.rl.learning.phases import LCSRL
-from difflcs.rl.learning.state import initialise_moments, load_moments, moments
+from difflcs.rl.learning.state_tree import initialise_moments, load_moments, moments
 from difflcs.rl.learning.surrogate import OUTLIER_KL, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.warmup import WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import Work
