@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import itertools
 import pickle
 import struct
 import threading
@@ -308,6 +309,18 @@ def test_a_deadline_ends_the_step_with_the_fallback(plain):
     assert controller.time_limit == 1e-9
     assert controller.plan.late
     assert not np.array_equal(controller.plan.u, planned) or controller.plan.iterations == 0
+
+
+def test_the_time_that_a_steps_own_system_takes_is_missing_in_no_later_step(build, plain, monkeypatch):
+    controller, x, clock = plain.controller(time_limit=100.0), states(1)[0], itertools.count(0, 100)
+    controller.step(x)
+    with monkeypatch.context() as patch:
+        patch.setattr("time.perf_counter", lambda: next(clock))
+        for own in (build.params(1), None):  # None: back to the first one, which takes time as well
+            controller.step(x, lcs=own)
+            assert controller.plan.late
+    controller.step(x)
+    assert not controller.plan.late
 
 
 def test_what_is_unfinished_can_be_acted_by_and_goes_on_in_the_next_step(build):
