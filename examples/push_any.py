@@ -149,6 +149,7 @@ class PushAnyPolicy(DiscPolicy):
         env: the environment.
         beyond: how far the disc may go beyond the square [px].
         learned: plan with the system that two minutes of random pushing teach, instead of the true one.
+        blind: do not tell it what is in the way.
     """
 
     MARGIN, PRICE = 0.05, 100.0
@@ -159,8 +160,8 @@ class PushAnyPolicy(DiscPolicy):
     """Pushes in succession without a gain, or steps in which the body comes no nearer, after which obstacles are
     ignored for so many steps."""
 
-    def __init__(self, env: StateEnv, beyond: float = 0.0, *, learned: bool = False):
-        self.env = env
+    def __init__(self, env: StateEnv, beyond: float = 0.0, *, learned: bool = False, blind: bool = False):
+        self.env, self._blind = env, blind
         env.reset(seed=0)
         system, center = pushing(env.block)
         if learned:
@@ -188,13 +189,13 @@ class PushAnyPolicy(DiscPolicy):
         """Start an episode."""
         super().reset()
         self.goal = self.env.goal_pose
-        self._shapes = [outline(body) for body in self.env.obstacles]
+        self._shapes = [] if self._blind else [outline(body) for body in self.env.obstacles]
         self._blocked = self._ignored = self._since = self._times = 0
         self._best, self._around = math.inf, None
 
     def act(self, observation: Any) -> Array:
         """See `DiscPolicy`."""
-        bodies = self.env.obstacles if not self._ignored else []
+        bodies = self.env.obstacles if self._shapes and not self._ignored else []
         poses = [[body.position.x / PIXELS, body.position.y / PIXELS, body.angle] for body in bodies]
         assert self.obstacles is not None
         shapes = self._shapes if bodies else []

@@ -49,6 +49,8 @@ class Options:
     """How far the disc may go beyond the square of 512 px [px]."""
     learned: bool = False
     """Plan with what two minutes of random pushing teach about each shape."""
+    blind: bool = False
+    """Do not tell the policy what is in the way."""
     shape: str = "all"
     """One of the shapes, or "all"."""
     json: bool = False
@@ -106,7 +108,7 @@ def main(o: Options) -> None:
     everything: list[Played] = []
     for name in names:
         env = StateEnv(object_name=name)
-        policy, limit = PushAnyPolicy(env, o.beyond, learned=o.learned), 5 if o.smoke else STEPS
+        policy, limit = PushAnyPolicy(env, o.beyond, learned=o.learned, blind=o.blind), 5 if o.smoke else STEPS
         played = [play_seed(env, policy, seed, limit) for seed in find_seeds(o)]
         everything += played
         if not o.json:

@@ -46,6 +46,9 @@ class Obstacles:
         self.radius, self.price = check_number("radius", radius, strict=True), check_number("price", price, strict=True)
         self.margin = radius / 3 if margin is None else check_number("margin", margin, strict=True)
         self._outline = ring(body, self.margin, _OUTLINE)
+        axis = torch.arange(-body.radius, body.radius, radius, dtype=torch.float64)
+        points = torch.cartesian_prod(axis, axis)
+        self._inside = points[body.contains(points)]
         self._rings: dict[tuple[Shape, float, int], Tensor] = {}
         self._grids: dict[Shape, DistanceGrid] = {}
         self.shapes, self.poses = (), torch.zeros(0, 3, dtype=torch.float64)
@@ -87,11 +90,13 @@ class Obstacles:
 
     def body_gap(self, poses: Tensor) -> Tensor:
         """Compute the gap (...) between the body at poses (..., 3) and the obstacles."""
-        return self.gap(poses[..., None, :2] + self._arms(poses)).amin(-1) + self.margin
+        outline, inside = (poses[..., None, :2] + _turned(poses, points) for points in (self._outline, self._inside))
+        gaps = torch.cat([self.gap(outline) + self.margin, self.gap(inside)], -1)  # small obstacles may be inside
+        return gaps.amin(-1)
 
     def constraints(self, states: Tensor) -> LinearConstraints | None:
         """Make half-planes for plans from states (n, n_x); None where everything is far away."""
-        arms = self._arms(states)
+        arms = _turned(states, self._outline)
         gap, nearest = self.gap(states[:, None, :2] + arms).unflatten(1, (_ARCS, -1)).min(-1)
         if not bool(gap.amin() < _FAR * self.radius):
             return None
@@ -119,10 +124,6 @@ class Obstacles:
                 self._rings[key] = ring(*key)
             points.append(pose[:2] + _turned(pose, self._rings[key]))
         return torch.cat(points)
-
-    def _arms(self, poses: Tensor) -> Tensor:
-        """Compute the ways (..., n, 2) from the origin of the body to the points round it."""
-        return _turned(poses, self._outline)
 
 
 def _turned(poses: Tensor, points: Tensor) -> Tensor:
