@@ -43,7 +43,7 @@ class HandPolicy:
         self.system, self.limit, self.patience = hand_system(model), 0.1 * pace, patience
         cost = hand_cost(self.system)
         self.mpc = LCSMPCLayer(
-            self.system, cost, 4, -self.limit, self.limit, BatchedBackend(effort="fast", threads=1), 1e-3, "mask"
+            self.system, cost, 4, -self.limit, self.limit, BatchedBackend(restarts=1, threads=1), 1e-3, "mask"
         )
         self.posture, self.guess, self.best, self.waited, self.openings = None, None, np.inf, 0, 0
         self.random = np.random.default_rng(0)

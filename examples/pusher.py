@@ -234,7 +234,7 @@ class PusherPolicy:
         )
         self.apart = [MujocoCost(self.module, [Distance("object", other)]) for other in ("goal", "tips_arm")]
         any_cost = self.apart[0].at(torch.zeros(self.module.n_x, dtype=torch.float64))
-        backend = BatchedBackend(effort="fast", threads=1)
+        backend = BatchedBackend(restarts=1, threads=1)
         self.press, horizon = press, STEPS if press else horizon
         self.mpc = LCSMPCLayer(self.module, any_cost, horizon, -2.0, 2.0, backend, 1e-4, "mask")
         self.model, self.data, self.ways = model, mujoco.MjData(model), ForkWays(model, self.module)

@@ -198,7 +198,7 @@ class HandPolicy:
                 Effort(s.effort),
             ],
         )
-        solver, far = BatchedBackend(effort="fast", threads=1), s.pace * self.limit
+        solver, far = BatchedBackend(restarts=1, threads=1), s.pace * self.limit
         self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
         self.settings, self.times = settings, []
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()

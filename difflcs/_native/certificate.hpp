@@ -11,6 +11,9 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
+// A residual above this may be rounding of s, or hide behind it.
+constexpr double kSure = 2e-7;
+
 // T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
 template <class T>
 struct Certificate {
@@ -203,6 +206,27 @@ struct Certificate {
     for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
     trajectory();
     const Mask weak = constraints();
+    costates(fragile);
+    // The rounding of s may be more than what is left: then it must also hold with the other reading of s.
+    const Mask unsure = worst > kSure;
+    if (any(unsure)) {
+      for (int64_t i = 0; i < h * nl; i++) gap[i] = select(unsure, batch.relaxation / lam[i], gap[i]);
+      costates(fragile);
+    }
+    for (int l = 0; l < count; l++) {
+      const int64_t e = elements[l];
+      const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
+      o.residual[e] = residual;
+      o.fragile[e] = fragile[l] != 0;
+      if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
+      if (weak[l] && o.status[e] == int8_t(Status::converged)) o.status[e] = int8_t(Status::degenerate);
+    }
+  }
+
+ private:
+  // Stationarity, by the costates from the last stage to the first, with s in `gap`.
+  void costates(Mask& fragile) {
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     enter(h);
     for (int64_t i = 0; i < nx; i++) {
       const T* weights = matrix[kQ_final][0];
@@ -229,7 +253,7 @@ struct Certificate {
           by_size += abs(C[j * nl + i] * p_size[j]);
           by_terms += abs(C[j * nl + i] * p_terms[j]);
         }
-        const Vec answer = abs(lk[i] / (s[i] + lk[i] * row));
+        const Vec answer = kAnswered * abs(lk[i] / (s[i] + lk[i] * row));
         rho_size[i] = answer * by_size;
         rho_terms[i] = answer * by_terms;
       }
@@ -289,17 +313,8 @@ struct Certificate {
         p_terms[i] = terms[i];
       }
     }
-    for (int l = 0; l < count; l++) {
-      const int64_t e = elements[l];
-      const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
-      o.residual[e] = residual;
-      o.fragile[e] = fragile[l] != 0;
-      if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
-      if (weak[l] && o.status[e] == int8_t(Status::converged)) o.status[e] = int8_t(Status::degenerate);
-    }
   }
 
- private:
   // Dynamics and complementarity of all stages, and the sizes of the states.
   void trajectory() {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;

@@ -142,6 +142,9 @@ constexpr double kDependent = 1e-3;
 constexpr double kAtPrice = 1.0 - 1e-12;
 // A scale is at least this part of its terms without cancellation: 1e-9 of that is rounding.
 constexpr double kCancelled = 1e-3;
+// What a contact answers to a costate counts with this factor there: beside F nearly singular it is so large that only
+// its rounding is forgiven.
+constexpr double kAnswered = 1e-5;
 // Factor of a step along a chain of states: so small that in most systems no size grows with it.
 constexpr double kFurther = 0.1;
 // Rounding of a sum, in parts of its terms.
@@ -152,7 +155,7 @@ constexpr double kGammaLeast = 4e-13;
 constexpr Tolerance kTolerances[] = {
     {"weak", kWeak},           {"singular", kSingular}, {"close", kClose},
     {"dependent", kDependent}, {"at_price", kAtPrice},  {"cancelled", kCancelled},
-    {"further", kFurther},     {"rounding", kRounding}, {"gamma_least", kGammaLeast},
+    {"answered", kAnswered},   {"further", kFurther},   {"rounding", kRounding}, {"gamma_least", kGammaLeast},
 };
 
 }  // namespace difflcs

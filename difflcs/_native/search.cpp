@@ -85,8 +85,9 @@ constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
 // It ends when kRounds in a row have not made the cost smaller by the part kGain. With fewer starts than kVaried there
-// is one round, of half of the shifts; with fewer than kFixed none.
+// is one round, of three shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
 constexpr double kGain = 1e-3;
+constexpr int64_t kFewVaried = 4, kSoftest = kVaried + 1;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
@@ -573,7 +574,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
   const Sizes n(batch);
   idle.assign(count, 0);
   const bool few = effort.starts < kVaried;
-  const int64_t varied = few ? kVaried / 2 : kVaried, rounds = few ? 1 : kMostRounds;
+  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : kMostRounds;
   const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
@@ -588,7 +589,8 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j] = {false, false, 0.0, comparison(batch)};
       tried.start[j].explore = kExploreFar;
       tried.start[j].needed = needed(batch, out.objective[e]);
-      vary(batch, effort, kVaried * round + j / elements, out.u + e * n.u, j);
+      const int64_t v = j / elements;
+      vary(batch, effort, few && v == varied - 1 ? kSoftest : kVaried * round + v, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {

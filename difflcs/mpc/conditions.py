@@ -15,7 +15,9 @@ from difflcs.mpc.solution import Primal, largest
 
 # Largest residual of a CONVERGED solution.
 CERTIFIED = 1e-6
-_AT_PRICE, _CANCELLED, _FURTHER = (TOLERANCES[name] for name in ("at_price", "cancelled", "further"))
+_AT_PRICE, _CANCELLED, _ANSWERED, _FURTHER = (
+    TOLERANCES[name] for name in ("at_price", "cancelled", "answered", "further")
+)
 
 
 @dataclass(frozen=True)
@@ -273,11 +275,12 @@ def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tenso
     not. So a size is the largest of: Σ|terms| of the number; the size at the next stage (of a state: the previous one);
     a tenth of |A| times the sizes there, or of the contact's response to the terms there. Along a chain of integrators
     it reaches as far as their rounding does. It grows along the horizon only with the numbers, or if A exceeds ten.
+    A contact's response counts 1e-5 of itself: beside a nearly singular F it is so large that only rounding is left.
     """
     X, steps, data = state_sizes(problem, primal), problem.steps(), stages_of(problem)
     u, lam, p, rho, s = (v.transpose(0, 1) for v in (primal.u, primal.lam, dual.p, dual.rho, dual.s))
-    # Response of ρ to a unit of Cᵀp, at most that of its contact by itself.
-    response = (lam / (s + lam * steps.F.abs().sum(-1))).abs()
+    # Response of ρ to a unit of Cᵀp, at most that of its contact by itself, times _ANSWERED.
+    response = _ANSWERED * (lam / (s + lam * steps.F.abs().sum(-1))).abs()
     stage_terms = _terms((steps.Q, X[:-1]), (steps.A.mT, p[1:]), (steps.D.mT, rho), (steps.S, u)) + steps.q.abs()
     terms = matvec(problem.Q_final.abs(), X[-1]) + problem.q_final.abs()
     if problem.n_c:

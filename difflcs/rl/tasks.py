@@ -368,7 +368,7 @@ def single_start_backend(name: str) -> Backend:
     """
     backend = get_backend(name)
     if isinstance(backend, BatchedBackend):
-        return replace(backend, effort="fast", homotopy=backend.homotopy or 100.0)
+        return replace(backend, restarts=1, homotopy=backend.homotopy or 100.0)
     return backend
 
 

@@ -253,9 +253,9 @@ def test_plans_of_many_contacts_get_more_starts():
 
     assert starts(5, 8, guessed=False) == [1, 4, 16]
     assert starts(5, 8, guessed=True) == [1, 1, 16]
-    assert starts(20, 5, guessed=False) == [1, 16, 64]
+    assert starts(20, 5, guessed=False) == [3, 16, 64]
     assert starts(20, 5, guessed=True) == [1, 1, 64]
-    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [1, 16, 64]
+    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [3, 16, 64]
     assert starts(10, 5, guessed=False, n_u=3) == [1, 4, 16]
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [5]
 
@@ -319,7 +319,7 @@ def test_iterations_hardly_grow_with_the_horizon():
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)
     x0 = low * (2 * torch.rand(8, 8, generator=torch.Generator().manual_seed(0)).double() - 1)
     goal = torch.tensor([0.2] * 4 + [0.0] * 4, dtype=torch.float64)
-    lcs, backend = carts(4, 0.05, 0.1, 0.02, damping=0.02), BatchedBackend(threads=1, effort="fast")
+    lcs, backend = carts(4, 0.05, 0.1, 0.02, damping=0.02), BatchedBackend(threads=1, restarts=1)
     means = []
     for horizon in (10, 40):
         mpc = LCSMPCLayer(lcs, cost, horizon, -5.0, 5.0, backend=backend, relaxation=1e-4)

@@ -154,7 +154,7 @@ def test_limits_far_from_the_actions_that_they_act_through_are_met(weight, limit
     cost = QuadraticCost(eye, 0.1 * torch.ones(1, 1, dtype=torch.float64), 10 * eye)
     row = torch.tensor([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]], dtype=torch.float64)
     rows = LinearConstraints(row, torch.full((2,), limit, dtype=torch.float64), weight=weight)
-    backend = BatchedBackend(effort="fast")  # one start, so that the iterations are those of one solve
+    backend = BatchedBackend(restarts=1)  # one start, so that the iterations are those of one solve
     mpc = LCSMPCLayer(cart_pole_between_walls(), cost, 25, -2.0, 2.0, backend=backend, constraints=rows)
     plan = mpc(torch.tensor([0.0, 0.1, 0.0, 0.7], dtype=torch.float64))
     assert bool(plan.mu.any())

@@ -17,11 +17,11 @@ from difflcs.mpc.solution import Primal
 from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
-_STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
+_STARTS: dict[str, tuple[int, int]] = {"fast": (1, 3), "default": (4, 16), "best": (16, 64)}
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with
 # four starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
-# Where these are easy, their starts agree, and half of them are enough (search.cpp).
-_MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON, _MORE_STARTS = 100, 20, 40, 4
+# They get the second of these numbers; where they are easy, their starts agree, and half are enough (search.cpp).
+_MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON = 100, 20, 40
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class BatchedBackend(Backend):
     an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
     long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. A
     local search follows, unless they agree: the best plan is shifted or stretched in time, pushed, or solved again from
-    softer contact, until that finds nothing better. Of four to seven starts only four shifts are tried.
+    softer contact, until that finds nothing better. Of four to seven starts only four of these are tried.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
-            n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the
-            first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
+        effort: "fast", one start; "default", four; "best", sixteen; 3, 16 and 64 where horizon × n_lam is 100 or
+            more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the first start, and
+            the only one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
@@ -175,11 +175,11 @@ class BatchedBackend(Backend):
         """Return the number of starts of each element; a guess is the first of them."""
         if self.restarts is not None:
             return self.restarts
-        if self.effort == "fast" or (guessed and self.effort != "best"):
+        if guessed and self.effort != "best":
             return 1  # a guess is taken to be near the optimum that is wanted
         contacts = problem.horizon * problem.n_lam
         many = contacts >= min(_MANY_CONTACTS, _MANY_PER_ACTION * problem.n_u) or problem.horizon >= _LONG_HORIZON
-        return _STARTS[self.effort] * (_MORE_STARTS if many else 1)
+        return _STARTS[self.effort][many]
 
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
