@@ -44,7 +44,7 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 
-QUICK = BatchedBackend(effort="fast", max_iter=100)
+QUICK = BatchedBackend(restarts=1, max_iter=100)
 """Solver of plans near obstacles: with their constraints, more starts and steps take longer than they are worth."""
 LOW, HIGH = 7, 504  # sides of the square inside the walls [px]
 ALIKE = 0.99  # part of the area that a turn must cover for a pose to count as the same
