@@ -197,7 +197,7 @@ def machine(record: dict) -> str:
 
 
 def efforts(record: dict) -> str:
-    """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time over that of the first."""
+    """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time over the first."""
     names = ("fast", "default", "best")
     rows = [
         [f"{kind} ({row['problems']})"]
