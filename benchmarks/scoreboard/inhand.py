@@ -242,7 +242,8 @@ class HandPolicy:
             return ctrl
         marks = [time.thread_time()]
         grips = data.geom_xpos[self.geom] + self.spots @ data.geom_xmat[self.geom].reshape(3, 3).T
-        x, bounds = self.module.observe(data), {}
+        bounds: dict[str, Any] = {}
+        x = self.module.observe(data)
         if self.aimed is not self.place and self.angle(data) < self.settings.turned:
             self.aim(self.goal)
         if self.aimed is not self.place:
