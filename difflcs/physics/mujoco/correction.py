@@ -33,6 +33,9 @@ _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to al
 _FARTHER = 0.25  # of the speed before and of what forces do, by which an error is more than that of standing still
 _JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
+_NEVER = (
+    1e4  # times what moves: a motion without constraints that grows beyond all bounds, which is no measure of errors
+)
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 
 
@@ -159,8 +162,10 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
         return np.sqrt(np.maximum((moved * (mass @ moved[..., None])[..., 0]).sum(-1), 0.0))
 
     off, alone = predicted - after, np.nan_to_num(size(free - before), nan=0.0, posinf=0.0)
+    least, change = _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2)), size(after - before)
+    alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
     due = size(before) + np.maximum(alone, _SMALL * alone.max(0))
-    most = size(after - before) + _FARTHER * due + _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2))
+    most = change + _FARTHER * due + least
     wrong = (size(off) > most).any(0)
     if wrong.any():
         worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)

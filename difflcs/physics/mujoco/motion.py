@@ -277,23 +277,28 @@ class Dynamic:
         # With ν = 0, ζ = 0 and u = ū.
         load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
         forces = np.concatenate([rates, B, load[:, :, None]], -1)
-        mass, inverse_mass = np.linalg.inv(read.inverse_mass).astype(np.float64), read.inverse_mass
+        inverse_mass, factor = read.inverse_mass, _factor(read.inverse_mass)
+        mass = (of_mass := np.linalg.inv(factor)).swapaxes(-1, -2) @ of_mass
         heavier, drag = mass, np.zeros_like(mass)
         if equality is not None:  # the rates have them
-            heavier = mass + equality.force @ equality.normal
-            inverse_mass = np.linalg.inv(heavier).astype(np.float64)
+            more = equality.force @ equality.normal
+            heavier, stiff = mass + more, np.eye(nv) + factor.swapaxes(-1, -2) @ more @ factor
+            held_by = np.linalg.cholesky(0.5 * (stiff + stiff.swapaxes(-1, -2)))
+            factor = np.linalg.solve(held_by, factor.swapaxes(-1, -2)).swapaxes(-1, -2)
+            inverse_mass = factor @ factor.swapaxes(-1, -2)
             drag = equality.force @ (equality.damping[:, :, None] * equality.normal)
         slow = -heavier @ rates[:, :nv, nv : 2 * nv] - drag
         damping = np.diag(self.damping) if self.steps.integrator == _EULER else slow
-        response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+        response = _implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         held = heavier if self.steps.integrator == _DISCRETE else mass
-        step, implicit = self._steps(held, forces, damping, self.steps), self._implicit(response @ heavier, forces)
+        step = self._steps(held, forces, damping, self.steps, factor)
+        implicit = self._implicit(response @ heavier, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        simulated = step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated)
+        simulated = step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated, factor)
         if (some := read.unstable).any():
-            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer)
+            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, factor)
         curved = self.actuators.curved[: read.secant.shape[2]] + n_x
         more = (read.reached - _reached(simulated, velocity))[:, :, None]
         more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
@@ -305,10 +310,10 @@ class Dynamic:
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
         return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal)
 
-    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps) -> Array:
+    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps, factor: Array) -> Array:
         """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
 
-        The `damping` (nv, nv) or (n, nv, nv) is implicit.
+        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of `_factor`, of the mass.
         """
         n, of, nv = len(forces), forces.shape[2], self.model.nv
         n_x = nv + forces.shape[1]
@@ -324,7 +329,7 @@ class Dynamic:
             rates, one[:] = forces[:, :nv].copy(), np.eye(of)
             if steps.integrator == _DISCRETE:  # at the position after the step
                 rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
-                response = _implicit_response(mass, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+                response = _implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
             else:
                 one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ rates)
@@ -476,12 +481,28 @@ def _reached(step: Array, velocity: Array) -> Array:
     return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]
 
 
-def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:
-    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly."""
-    lower = np.linalg.cholesky(mass)
-    resists = -h * mass @ (D + h * K)
-    resists = 0.5 * (resists + resists.swapaxes(-1, -2))
-    scaled = np.linalg.solve(lower, np.linalg.solve(lower, resists).swapaxes(-1, -2))
+def _implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
+    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly.
+
+    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, as M itself has lost the lightest bodies to rounding where some are
+    10¹⁰ times as heavy.
+    """
+    scaled = -h * np.linalg.solve(factor, (D + h * K) @ factor)
     size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
-    directions = np.linalg.solve(lower.swapaxes(-1, -2), directions)
+    directions = factor @ directions
     return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)
+
+
+def _factor(inverse_mass: Array) -> Array:
+    """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
+
+    Raises:
+        InvalidInputError: rounding leaves no such factor.
+    """
+    try:
+        return np.linalg.cholesky(inverse_mass)
+    except np.linalg.LinAlgError:
+        raise InvalidInputError(
+            "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
+            "make the lightest bodies heavier, or add armature to their joints"
+        ) from None
