@@ -33,9 +33,7 @@ _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to al
 _FARTHER = 0.25  # of the speed before and of what forces do, by which an error is more than that of standing still
 _JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
-_NEVER = (
-    1e4  # times what moves: a motion without constraints that grows beyond all bounds, which is no measure of errors
-)
+_NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 
 
