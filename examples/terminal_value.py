@@ -8,19 +8,31 @@ noisy episodes, computes from each state what the next steps cost, and fits to t
 where zᵢ, of each fingertip and axis, are the fingertip's place from the cube and the cube's place from its goal. V is a
 convex quadratic of the state for each goal, so a mixture with the final cost is a `GoalCost` again, and the solver
 stays exact. Printed are success and mean return on the same goals, with the task's final cost and with each mixture.
+
+    python examples/terminal_value.py train --method value-lcs --task cube --minutes 10 --seed 20 --out RUN
+    python examples/terminal_value.py evaluate RUN
+
+is the command `difflcs` with the method that this file registers: LCS-RL with such a horizon, where a part of V is
+added to the final cost after the warm-up, fitted to its episodes. PPO then moves P and p together with the LCS, by its
+gradient through the MPC. With `--share 0` the method is the same without V, with `--no-move` V stays as fitted.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from difflcs import GoalCost, LCSModel, LCSMPCLayer
-from difflcs.rl import get_task
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, QuadraticCost, cli
+from difflcs.rl import TaskSpec, Trainer, bounded, get_task, register_method
+from difflcs.rl.learning.lcsrl import LCSRL
+from difflcs.rl.methods import LCSRLMethod, Work
+from difflcs.rl.methods.phases import main_phase, warmup_phase
 from difflcs.rl.rollout import collect, mpc_actions, noisy_actions
 from difflcs.rl.seeding import Stream, episode_seeds
 from difflcs.rl.tasks import single_start_backend
@@ -122,6 +134,115 @@ def with_value(cost: GoalCost, features: Sequence[Maps], weights: Sequence[Tenso
     )
 
 
+def fit_to_episodes(cost: GoalCost, episodes: Any, lookahead: int) -> tuple[list[Tensor], float]:
+    """Fit the value of pushing to episodes, see `fit_value`."""
+    state, action, goal = (episodes[k] for k in ("state", "action", "goal"))
+    returns = compute_returns(cost, state, action, goal, lookahead)
+    goals = goal.unsqueeze(1).expand(-1, returns.shape[1], -1)
+    starts = state[:, : returns.shape[1]].flatten(0, 1)
+    return fit_value(pushing_features(), starts, goals.flatten(0, 1), returns.flatten())
+
+
+class ValueLCS(LCSModel):
+    """An `LCSModel` with four numbers of a value besides: the Cholesky factor of P by rows and √p, in `UNIT`."""
+
+    kind = "ValueLCS"
+    batched = True
+    UNIT = 100.0
+    value: nn.Parameter
+
+    def __init__(self, *sizes, **options):
+        super().__init__(*sizes, **options)
+        with torch.no_grad():
+            self.value.zero_()
+
+    @staticmethod
+    def _shapes(x: int, u: int, m: int) -> dict[str, tuple[int, ...]]:
+        return {**LCSModel._shapes(x, u, m), "value": (4,)}
+
+    def weights(self) -> list[Tensor]:
+        """Return P (..., 2, 2) and p (..., 1, 1)."""
+        a, b, c, yaw = (self.UNIT * self.value).unbind(-1)
+        factor = torch.stack([torch.stack([a, torch.zeros_like(a)], -1), torch.stack([b, c], -1)], -2)
+        return [factor @ factor.mT, yaw.square()[..., None, None]]
+
+    @torch.no_grad()
+    def take(self, weights: Sequence[Tensor]) -> None:
+        """Make these the weights of the value."""
+        (a, _), (b, c) = torch.linalg.cholesky(weights[0] + 1e-6 * torch.eye(2, dtype=torch.float64))
+        self.value.copy_(torch.stack([a, b, c, weights[1].squeeze().sqrt()]) / self.UNIT)
+
+
+class ValueCost(nn.Module):
+    """A `CostModule`: the cost of the task, and the value of a `ValueLCS` in the final cost."""
+
+    X: Tensor
+    G: Tensor
+    x_yaw: Tensor
+    goal_yaw: Tensor
+
+    def __init__(self, cost: GoalCost, lcs: ValueLCS):
+        super().__init__()
+        self.cost, self.n_x, self.n_u, self.n_goal = cost, cost.n_x, cost.n_u, cost.n_goal
+        self._lcs = (lcs,)  # its parameters are those of the MPC's system already
+        (X, G), (x_yaw, goal_yaw) = pushing_features()
+        for name, value in {"X": X, "G": G, "x_yaw": x_yaw, "goal_yaw": goal_yaw}.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> QuadraticCost:
+        """See `CostModule`."""
+        assert goal is not None
+        P, p = self._lcs[0].weights()
+        square = (self.X.mT @ P.unsqueeze(-3) @ self.X).sum(-3) + (self.x_yaw.mT * p @ self.x_yaw).squeeze(0)
+        by_goal = (self.X.mT @ P.unsqueeze(-3) @ self.G).sum(-3) + (self.x_yaw.mT * p @ self.goal_yaw).squeeze(0)
+        own = self.cost(goal)
+        q_final = own.q_final - (by_goal @ goal.unsqueeze(-1)).squeeze(-1)
+        return QuadraticCost(own.Q, own.R, own.Q_final + square, own.q, own.r, q_final, own.constant, check=False)
+
+
+@register_method
+@dataclass(frozen=True)
+class ValueMethod(LCSRLMethod):
+    """LCS-RL with a short horizon and a value at its end, for the pushing tasks of the library."""
+
+    horizon: int = bounded(2, minimum=1, maximum=100)
+    """Steps that the MPC plans ahead."""
+    share: float = bounded(0.25, minimum=0)
+    """Share of the fitted value that is added to the final cost after the warm-up; 0: no value."""
+    move: bool = True
+    """PPO moves the value together with the LCS."""
+    lookahead: int = bounded(6, minimum=1)
+    """Steps that a return sums."""
+
+    name: ClassVar[str] = "value-lcs"
+    version: ClassVar[int] = 1
+    summary: ClassVar[str] = "LCS-RL with a learned value at the end of a short horizon (examples/terminal_value.py)"
+    kind: ClassVar[str] = ValueLCS.kind
+    takes_init: ClassVar[bool] = False
+    model: ClassVar[type[LCSModel]] = ValueLCS
+
+    def policy(self, task: TaskSpec, learned: Any) -> LCSMPCLayer:
+        """See `Method`."""
+        cost: Any = task.make_cost()
+        return super().policy(replace(task, horizon=self.horizon, make_cost=lambda: ValueCost(cost, learned)), learned)
+
+    def trainer(self, work: Work) -> Trainer:
+        """See `Method`."""
+        lcs: Any = self.initial(work)
+        lcs.value.requires_grad_(self.move and self.share > 0)
+        policy = self.policy(work.task, lcs)
+        warmup = warmup_phase(work, lcs, policy, self.warmup)
+
+        def main(first_episode: int, first_iteration: int) -> Any:
+            cost: Any = work.task.make_cost()
+            if self.share and len(warmup.buffer):  # a resumed training has a value already
+                weights, _ = fit_to_episodes(cost, warmup.buffer, self.lookahead)
+                lcs.take([self.share * weight for weight in weights])
+            return main_phase(work, policy, self.ppo, self.models, first_episode, first_iteration)
+
+        return LCSRL(warmup, round(self.warmup_minutes * work.task.steps_per_minute), main)
+
+
 @dataclass
 class Options:
     """Fit a value to episodes, and plan with it."""
@@ -169,17 +290,16 @@ def main(o: Options) -> None:
 
     report("final cost of the task", cost)
     parts = play(cost, o.episodes, 5, Stream.TRAINING, o.noise)
-    state, action, goal = (torch.cat([part[part["stable"]][k] for part in parts]) for k in ("state", "action", "goal"))
-    returns = compute_returns(cost, state, action, goal, o.lookahead)
-    starts = state[:, : returns.shape[1]]
-    goals = goal.unsqueeze(1).expand(-1, returns.shape[1], -1)
-    weights, explained = fit_value(features, starts.flatten(0, 1), goals.flatten(0, 1), returns.flatten())
+    episodes: Any = torch.cat(parts)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    weights, explained = fit_to_episodes(cost, episodes[episodes["stable"]], o.lookahead)
     print(f"P {weights[0].tolist()}, p {float(weights[1]):.3g}: {100 * explained:.0f} % of the variance explained")
     for share in o.shares:
         report(f"{share:g} of the value", with_value(cost, features, weights, share))
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] in (["train"], ["evaluate"]):
+        sys.exit(cli.main(sys.argv[1:]))
     import tyro
 
     main(tyro.cli(Options))

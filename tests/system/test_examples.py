@@ -82,3 +82,24 @@ def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
     assert explained > 0.999
     torch.testing.assert_close(weights, wanted, rtol=1e-2, atol=1e-2)
     torch.testing.assert_close(t.with_value(cost, features, wanted, 0.0)(goal, 2).tensors(), cost(goal, 2).tensors())
+
+
+def test_a_value_is_fitted_after_the_warmup_and_moves_with_the_lcs(tmp_path):
+    import terminal_value as t
+    import torch
+
+    from difflcs.rl import TrainConfig, train
+
+    values = []
+    for move in (False, True):
+        method = t.ValueMethod(n_lam=3, move=move).smoke()
+        config = TrainConfig(task="cube", method=method, minutes=0.5, final_goals=0, evaluate_at=())
+        lcs = t.ValueLCS.from_pretrained(train(config, tmp_path / str(move)).model)
+        values.append(lcs.value.detach())
+        goal, cost = torch.ones(3, dtype=torch.float64), t.get_task("cube").make_cost()
+        both = t.ValueCost(cost, lcs).at(goal, goal)
+        alone = t.with_value(cost, t.pushing_features(), lcs.weights(), 1.0)
+        torch.testing.assert_close(both.Q_final, cost.Q_final + alone.Q_final)
+        torch.testing.assert_close(both.q_final, cost(goal).q_final + alone(goal).q_final)
+    assert all(bool(value[0] > 0) for value in values)
+    assert not torch.equal(*values)
