@@ -31,7 +31,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import flags, native
+from difflcs.physics.mujoco.native import factor_inverse, flags, native
 
 Array = NDArray[np.float64]
 
@@ -277,7 +277,7 @@ class Dynamic:
         # With ν = 0, ζ = 0 and u = ū.
         load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
         forces = np.concatenate([rates, B, load[:, :, None]], -1)
-        inverse_mass, factor = read.inverse_mass, _factor(read.inverse_mass)
+        inverse_mass, factor = read.inverse_mass, factor_inverse(read.inverse_mass)
         mass = (of_mass := np.linalg.inv(factor)).swapaxes(-1, -2) @ of_mass
         heavier, drag = mass, np.zeros_like(mass)
         if equality is not None:  # the rates have them
@@ -313,7 +313,7 @@ class Dynamic:
     def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps, factor: Array) -> Array:
         """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
 
-        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of `_factor`, of the mass.
+        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of M⁻¹, of the mass.
         """
         n, of, nv = len(forces), forces.shape[2], self.model.nv
         n_x = nv + forces.shape[1]
@@ -491,18 +491,3 @@ def _implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
     size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
     directions = factor @ directions
     return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)
-
-
-def _factor(inverse_mass: Array) -> Array:
-    """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
-
-    Raises:
-        InvalidInputError: rounding leaves no such factor.
-    """
-    try:
-        return np.linalg.cholesky(inverse_mass)
-    except np.linalg.LinAlgError:
-        raise InvalidInputError(
-            "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
-            "make the lightest bodies heavier, or add armature to their joints"
-        ) from None

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._differentiation import is_wrapped
@@ -91,3 +92,18 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
     for name, values in kept.items():
         getattr(data, name)[:] = values
     raise InvalidInputError(f"{text.format(**size)} ({where})") from said
+
+
+def factor_inverse(inverse_mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
+
+    Raises:
+        InvalidInputError: rounding leaves no such factor.
+    """
+    try:
+        return np.linalg.cholesky(inverse_mass).astype(np.float64)
+    except np.linalg.LinAlgError:
+        raise InvalidInputError(
+            "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
+            "make the lightest bodies heavier, or add armature to their joints"
+        ) from None
