@@ -4,6 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+
+from difflcs import LCSModel
+from difflcs.rl import TrainConfig, train
 
 BODY = """<body name="{0}"><joint name="{0}_x" damping="4" type="slide" axis="1 0 0"/>
   <joint name="{0}_y" damping="4" type="slide" axis="0 1 0"/>
@@ -70,7 +74,6 @@ def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
 
 def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
     import terminal_value as t
-    import torch
 
     state, goal = (0.1 * torch.randn(400, n, dtype=torch.float64) for n in (9, 3))
     features, cost = t.pushing_features(), t.get_task("cube").make_cost()
@@ -86,15 +89,11 @@ def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
 
 def test_a_value_is_fitted_after_the_warmup_and_moves_with_the_lcs(tmp_path):
     import terminal_value as t
-    import torch
-
-    from difflcs.rl import TrainConfig, train
 
     values = []
     for move in (False, True):
         method = t.ValueMethod(n_lam=3, move=move).smoke()
-        config = TrainConfig(task="cube", method=method, minutes=0.5, final_goals=0, evaluate_at=())
-        lcs = t.ValueLCS.from_pretrained(train(config, tmp_path / str(move)).model)
+        lcs = t.ValueLCS.from_pretrained(_train_briefly(method, tmp_path / str(move)))
         values.append(lcs.value.detach())
         goal, cost = torch.ones(3, dtype=torch.float64), t.get_task("cube").make_cost()
         both = t.ValueCost(cost, lcs).at(goal, goal)
@@ -103,3 +102,20 @@ def test_a_value_is_fitted_after_the_warmup_and_moves_with_the_lcs(tmp_path):
         torch.testing.assert_close(both.q_final, cost(goal).q_final + alone(goal).q_final)
     assert all(bool(value[0] > 0) for value in values)
     assert not torch.equal(*values)
+
+
+def test_a_mixture_is_learned_and_averages_its_systems(tmp_path):
+    import mixture as m
+
+    lcs = m.MixtureLCS.from_pretrained(_train_briefly(m.MixtureMethod(n_lam=3).smoke(), tmp_path))
+    x, systems = torch.randn(4, 9, dtype=torch.float64), []
+    for k in range(m.COMPONENTS):
+        systems.append(LCSModel(9, 6, 3))
+        systems[k].load_state_dict({name: getattr(lcs, name)[k] for name in LCSModel.parameter_names})
+    weights, F = lcs.weights(x), torch.stack([system.F for system in systems])
+    torch.testing.assert_close(lcs.params(x).F, torch.einsum("nk,kij->nij", weights, F))
+
+
+def _train_briefly(method, out):
+    config = TrainConfig(task="cube", method=method, minutes=0.5, final_goals=0, evaluate_at=())
+    return train(config, out / "run").model
