@@ -228,7 +228,7 @@ def test_what_cannot_be_learned_is_refused(lcs, error, message):
 
 
 def test_other_sizes_than_the_environments_are_refused():
-    with pytest.raises(InvalidInputError, match=r"lcs: expected n_x=1, n_u=1 like the states and actions .* n_u=2 of Wide"):
+    with pytest.raises(InvalidInputError, match=r"lcs: expected n_x=1, n_u=1 like the states .* n_u=2 of Wide"):
         slide_warmup(Wide())
     settings, mpc = slide.small_settings(), LCSMPCLayer(LCSModel(2, 1, 1), GoalCost.reach(2, 1), 3, -1.0, 1.0)
     with pytest.raises(InvalidInputError, match=r"actor: expected n_x=1, n_u=1 .* got n_x=2"):
