@@ -2,8 +2,8 @@
 
 `python docs/figures/methods.py`
 
-Above success over minutes of data on the cube, below at the end on all seven objects. What each method is
-told stands in the legend.
+Above success over minutes of data on the cube, of methods that are told nothing, and apart of those that are told
+something of the object or of its state; below at the end on all seven objects.
 """
 
 from __future__ import annotations
@@ -29,14 +29,18 @@ from tables import largest  # noqa: E402
 Points = dict[float, list[float]]
 """Minutes of data → success [%] of each seed."""
 OBJECTS = ("cube", "sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
-STYLES = {
+NOTHING = {
+    "lcs-rl": ("LCS-RL", "#d55e00"),
+    "pddm": ("PDDM (networks)", "#009e73"),
+    "ppo": ("PPO without warm-up", "#e69f00"),
+    "violation": ("violation loss only", "#0072b2"),
+}
+"""Methods that are told nothing → names, colours."""
+SOMETHING = {
     "contact-lcs": ("ContactLCS, told the outline", "#cc79a7"),
     "frame-lcs": ("LCS in the body's frame, told the plane", "#56b4e9"),
-    "lcs-rl": ("LCS-RL, told nothing", "#d55e00"),
-    "pddm": ("PDDM (networks), told nothing", "#009e73"),
-    "violation": ("violation loss only, told nothing", "#0072b2"),
 }
-"""Methods → names with what they are told, colours."""
+"""Those that are told something → names with what it is, colours."""
 
 
 def recorded(task: str, method: str) -> Points:
@@ -64,9 +68,9 @@ def estimates(points: Points) -> dict[float, Estimate]:
     return {minute: bootstrap([values]) for minute, values in points.items()}
 
 
-def draw_minutes(axes: Axes) -> None:
-    """The cube."""
-    for method, (label, color) in STYLES.items():
+def draw_minutes(axes: Axes, methods: dict[str, tuple[str, str]], title: str, lowest: float) -> None:
+    """Methods on the cube, which are told the same."""
+    for method, (label, color) in methods.items():
         points = points_of("cube", method)
         if not points:
             continue
@@ -78,17 +82,17 @@ def draw_minutes(axes: Axes) -> None:
         axes.plot(list(found), [e.value for e in found.values()], "o-", ms=4, color=color, label=f"{label} ({amount})")
         low, high = [e.low for e in found.values()], [e.high for e in found.values()]
         axes.fill_between(list(found), low, high, color=color, alpha=0.2, linewidth=0)
-    axes.set_ylim(0, 101)
+    axes.set_ylim(lowest, 101)
     axes.set_xlim(0, 30.5)
-    axes.set_xlabel("minutes of data on the cube")
+    axes.set_title(title, loc="left", fontsize=12)
     axes.set_ylabel("goals reached [%]")
     axes.legend(fontsize=11, frameon=False, loc="lower right")
 
 
 def draw_objects(axes: Axes) -> None:
     """The last evaluation on every object; that of ContactLCS after three minutes."""
-    for k, method in enumerate(m for m in STYLES if m not in ("pddm", "frame-lcs")):
-        _, color = STYLES[method]
+    for k, method in enumerate(("contact-lcs", "lcs-rl", "violation")):
+        _, color = {**NOTHING, **SOMETHING}[method]
         for y, task in enumerate(OBJECTS):
             points = points_of(task, method)
             minute = 3.0 if method == "contact-lcs" else max(points, default=0.0)
@@ -108,10 +112,14 @@ def draw_objects(axes: Axes) -> None:
 def main() -> None:
     """Draw it."""
     plt.rcParams["font.size"] = 12  # legible on a phone
-    fig, (above, below) = plt.subplots(2, 1, figsize=(7.0, 7.0), layout="constrained", height_ratios=[1.15, 1])
-    draw_minutes(above)
+    fig, (above, middle, below) = plt.subplots(
+        3, 1, figsize=(7.0, 9.0), layout="constrained", height_ratios=[3, 1.2, 3]
+    )
+    draw_minutes(above, NOTHING, "told nothing", 0)
+    draw_minutes(middle, SOMETHING, "told something", 79)
+    middle.set_xlabel("minutes of data on the cube")
     draw_objects(below)
-    for axes in (above, below):
+    for axes in (above, middle, below):
         axes.spines[["top", "right"]].set_visible(False)
     fig.savefig(HERE / "methods.png", dpi=150)
 
