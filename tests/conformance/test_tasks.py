@@ -2,6 +2,7 @@
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,9 +10,18 @@ import torch
 from difflcs import LCSModel
 from difflcs.rl.rollout import collect, mpc_actions, uniform_actions
 from difflcs.rl.tasks import get_task, task_names
+from difflcs_envs.tasks import MOVE, trifinger_task
 from tests.conformance.toy import make_task
 
+OTHER_NUMBERS = [  # of an environment: model rollouts learn from what its task says
+    {"reward_weights": {"tips": 0.0, "action": 100.0}, "sparse_penalty": 3.0, "horizon": 3},
+    {"position_tolerance": 0.5, "yaw_tolerance": 3.0, "sparse_penalty": 3.0, "horizon": 4},
+]
 TASKS = {**{name: get_task(name) for name in task_names()}, "toy": make_task("conformance-toy")}
+TASKS |= {
+    f"other numbers {i}": trifinger_task("own", "TriFingerMoveCube-v0", MOVE, "Own.", ((0.0, 0.0, 0.0),), **numbers)
+    for i, numbers in enumerate(OTHER_NUMBERS)
+}
 
 
 pytestmark = pytest.mark.usefixtures("stand_ins")
@@ -78,6 +88,17 @@ def test_only_the_end_costs_the_penalty(task):
     np.testing.assert_allclose(going - ended, task.failure_penalty * ~success, rtol=0, atol=1e-9)
 
 
+def test_the_reward_has_a_gradient_and_is_mapped(task, env):
+    start, goal = (torch.from_numpy(env.reset(seed=0)[0][key]) for key in ("state", "goal"))
+    generator, around = torch.Generator().manual_seed(0), (start, torch.zeros(task.n_u).double(), start)
+    step = [v + 0.05 * torch.randn(3, len(v), generator=generator, dtype=torch.float64) for v in around]
+    step, ends = [v.requires_grad_() for v in step], torch.arange(3) % 2 == 0
+    assert torch.autograd.gradcheck(lambda *step: task.outcome(*step, goal, ends)[0], step)
+    mapped = torch.func.vmap(task.outcome, (0, 0, 0, None, 0))(*step, goal, ends)
+    for found, expected in zip(mapped, task.outcome(*step, goal, ends), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
 def test_features_are_finite_and_as_many_as_it_says(task, env):
     observations = [env.reset(seed=seed)[0] for seed in range(5)]
     state, goal = (torch.from_numpy(np.stack([o[key] for o in observations])) for key in ("state", "goal"))
@@ -115,12 +136,15 @@ def test_everything_random_comes_from_the_seed(task):
     assert not torch.equal(episode(1), episode(2))
 
 
-def test_it_is_described_in_json_single_or_not(task, env):
+def test_it_is_described_in_json_through_wrappers_and_vectors(task, env):
     found = dict(task.describe(env))
     assert json.loads(json.dumps(found)) == found
-    envs = task.make_envs(2)
-    assert dict(task.describe(envs)) == found
-    envs.close()
+    vectors = [task.make_envs(2), gymnasium.vector.SyncVectorEnv([task.make_env] * 2)]
+    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(task.make_envs(2))
+    for one in (env.unwrapped, *vectors, wrapped):
+        assert dict(task.describe(one)) == found
+    for envs in (*vectors, wrapped):
+        envs.close()
 
 
 def test_the_policy_of_a_random_model_acts(task):
