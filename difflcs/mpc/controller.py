@@ -284,7 +284,6 @@ class MPCController:
     def _set_inputs(self, setup: Setup, inputs: Inputs, overrides: dict[str, Any]) -> None:
         """Replace the numbers of the problem by others of the same shapes."""
         values, constant = numbers_of_one(inputs)
-        check_finite({name: values[name] for name in SYSTEM})
         fields = dict(self._first_inputs)
         for part, names in _CHANGES.items():  # bounds may depend on the state if the layer's system does
             if part in self._modules or overrides[part] is not None or part in ("u_min", "u_max"):
@@ -295,9 +294,12 @@ class MPCController:
                         f"{part}: expected {name} {tuple(first.shape)} as in the first step, got "
                         f"{tuple(fields[name].shape)}; make another controller"
                     )
-        check_bounds(fields["u_min"], fields["u_max"], strict=setup.barrier > 0)
+        if setup.barrier > 0 or not bool((fields["u_min"] < fields["u_max"]).all()):  # else neither is infinite wrongly
+            check_bounds(fields["u_min"], fields["u_max"], strict=setup.barrier > 0)
         new_cost = "cost" in self._modules or overrides["cost"] is not None
         arrays = [value.numpy() for value in fields.values()]
+        if not _kernels.all_finite(arrays[: len(SYSTEM)]):
+            check_finite({name: values[name] for name in SYSTEM})
         self._native.set_inputs(arrays, constant if new_cost else self._constant)
 
     def reset(self) -> None:

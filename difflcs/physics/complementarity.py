@@ -22,8 +22,9 @@ within the step, so that friction is right at every step of a plan. Two models o
 """
 
 import warnings
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -201,50 +202,56 @@ def contact_lcs(
 def assemble_lcs(
     contacts: Contacts,
     free: FreeMotion,
-    x: Tensor,
-    mu: Tensor,
-    soft: Tensor,
+    x: Any,
+    mu: Any,
+    soft: Any,
     cone: Cone,
     length: float,
     force: float,
-    rest: Tensor | None = None,
+    rest: Any = None,
     unilateral: Unilateral | None = None,
     bounded: Bounded | None = None,
 ) -> dict[str, Tensor]:
     """Compute the matrices of `contact_lcs` by name, of its arguments; nothing is checked.
 
-    There is friction `mu` (..., n_contacts), and `soft` (..., n), the compliance of each contact, one-sided constraint
-    and bounded force in units of length / force.
+    The numbers are all tensors, or all NumPy arrays, which take a third of the time at a single state. There is
+    friction `mu` (..., n_contacts), and `soft` (..., n), the compliance of each contact, one-sided constraint and
+    bounded force in units of length / force.
     """
+    of: Any = torch if isinstance(x, Tensor) else np
     n_contacts, n_tangents = contacts.gap.shape[-1], contacts.tangent.shape[-2]
     more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
     stewart_trinkle = cone == "stewart-trinkle" and n_tangents > 0 and n_contacts > 0
     directions = _normals_and_tangents if stewart_trinkle else _rays
     rows, normals, gap = directions(contacts, mu) if n_tangents else (contacts.normal, contacts.normal, contacts.gap)
     each = rows.shape[-2] // max(n_contacts, 1)
-    softness = soft[..., :n_contacts].repeat_interleave(each, -1)
-    C = (free.response @ rows.mT) * force
+    softness = _repeat(soft[..., :n_contacts], each, -1)
+    C = (free.response @ rows.swapaxes(-1, -2)) * force
     if more:
-        effects = [free.response @ m[1].mT if m.effect is None else m.effect for m in more]
-        counted = [m[1] if isinstance(m, Unilateral) else torch.zeros_like(m[1]) for m in more]
+        effects = [free.response @ m[1].swapaxes(-1, -2) if m.effect is None else m.effect for m in more]
+        counted = [m[1] if isinstance(m, Unilateral) else of.zeros_like(m[1]) for m in more]
         rows, normals = _join(-2, rows, *(m[1] for m in more)), _join(-2, normals, *counted)
-        gap, softness = _join(-1, gap, *(m[0] for m in more)), torch.cat([softness, soft[..., n_contacts:]], -1)
-        C = torch.cat([C, *(effect.expand(*C.shape[:-1], -1) * force for effect in effects)], -1)
+        gap, softness = _join(-1, gap, *(m[0] for m in more)), of.concatenate([softness, soft[..., n_contacts:]], -1)
+        C = _join(-1, C, *(effect * force for effect in effects))
     rows, normals = rows / length, normals / length
     F = rows @ C
-    F = 0.5 * (F + F.mT) + torch.diag_embed(softness.expand(F.shape[:-1]))
+    n_lam = F.shape[-1]
+    one = torch.eye(n_lam, dtype=F.dtype, device=F.device) if of is torch else np.eye(n_lam)
+    F = 0.5 * (F + F.swapaxes(-1, -2)) + softness[..., None] * one
     D = rows @ free.A - (rows - normals)
-    c = gap / length + matvec(rows, free.d) - matvec(normals, x)
-    forces = torch.arange(F.shape[-1], device=F.device)
+    c = gap / length + _apply(rows, free.d) - _apply(normals, x)
+    forces = np.arange(n_lam)
     if stewart_trinkle:
-        forces += torch.div(forces, each, rounding_mode="floor").clamp(max=n_contacts)
+        forces += np.minimum(forces // each, n_contacts)
     c = c if rest is None else c - softness * rest[..., forces] / force
-    system = _Rows(C, free.d, D, rows @ free.B, F, c)
+    found = free.A, free.B, C, free.d, D, rows @ free.B, F, c
+    A, B, *changed = found if of is torch else map(torch.from_numpy, found)
+    system = _Rows(*changed)
     if stewart_trinkle:
-        system = _limit_friction(system, mu, each, forces)
+        system = _limit_friction(system, torch.as_tensor(mu), each, torch.from_numpy(forces).to(system.F.device))
     if bounded is not None and bounded.offset.shape[-1]:
-        system = _bound(system, bounded.lower / force, bounded.upper / force)
-    return {"A": free.A, "B": free.B, **system._asdict()}
+        system = _bound(system, *(torch.as_tensor(v / force) for v in (bounded.lower, bounded.upper)))
+    return {"A": A, "B": B, **system._asdict()}
 
 
 class _Rows(NamedTuple):
@@ -279,10 +286,22 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
     return _Rows(C, d, D, E, F, _join(-1, c, upper - lower))
 
 
-def _join(dim: int, *parts: Tensor) -> Tensor:
-    """Concatenate vectors (dim −1) or rows of matrices (dim −2), whose batch dimensions broadcast."""
+def _join(dim: int, *parts: Any) -> Any:
+    """Concatenate along a dimension arrays whose dimensions before it broadcast."""
+    of: Any = torch if isinstance(parts[0], Tensor) else np
     batch = broadcast_batch([("part", part.shape[:dim]) for part in parts])
-    return torch.cat([part.expand(*batch, *part.shape[dim:]) for part in parts], dim)
+    alike = (p if tuple(p.shape[:dim]) == tuple(batch) else of.broadcast_to(p, (*batch, *p.shape[dim:])) for p in parts)
+    return of.concatenate(tuple(alike), dim)
+
+
+def _apply(matrix: Any, vector: Any) -> Any:
+    """Multiply a matrix with a vector."""
+    return matvec(matrix, vector) if isinstance(matrix, Tensor) else (matrix @ vector[..., None])[..., 0]
+
+
+def _repeat(values: Any, times: int, dim: int) -> Any:
+    """Repeat each of some values along a dimension."""
+    return values.repeat_interleave(times, dim) if isinstance(values, Tensor) else values.repeat(times, dim)
 
 
 def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
@@ -332,23 +351,25 @@ def _per_row(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Ten
     return value if value.ndim and value.shape[-1] == gap.shape[-1] else value.expand(*value.shape[:-1], gap.shape[-1])
 
 
-def _rays(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _rays(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
     """Compute the extreme rays n ± μ t of each contact, what of them counts from x̄, and their gaps."""
-    per = 2 * contacts.tangent.shape[-2]
-    normal, slide = contacts.normal.unsqueeze(-2), mu[..., None, None] * contacts.tangent
-    rays = torch.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
-    return rays.flatten(-4, -2), contacts.normal.repeat_interleave(per, -2), contacts.gap.repeat_interleave(per, -1)
+    of: Any = torch if isinstance(mu, Tensor) else np
+    n, n_tangents, n_x = contacts.tangent.shape[-3:]
+    normal, slide = contacts.normal[..., None, :], mu[..., None, None] * contacts.tangent
+    rays = of.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
+    normals, gap = _repeat(contacts.normal, 2 * n_tangents, -2), _repeat(contacts.gap, 2 * n_tangents, -1)
+    return rays.reshape(*rays.shape[:-4], 2 * n * n_tangents, n_x), normals, gap
 
 
-def _normals_and_tangents(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _normals_and_tangents(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
     """Compute the same of the directions n, t and −t of each contact, with a gap along n alone."""
-    del mu
-    both = torch.stack([contacts.tangent, -contacts.tangent], -2).flatten(-3, -2)
-    normal = contacts.normal.unsqueeze(-2)
-    still = torch.zeros_like(both)
-    gap = torch.nn.functional.pad(contacts.gap.unsqueeze(-1), (0, both.shape[-2]))
-    rows, normals = (torch.cat([normal, v], -2).flatten(-3, -2) for v in (both, still))
-    return rows, normals, gap.flatten(-2)
+    of: Any = torch if isinstance(mu, Tensor) else np
+    normal, (*batch, n, _, n_x) = contacts.normal[..., None, :], contacts.tangent.shape
+    both = of.stack([contacts.tangent, -contacts.tangent], -2).reshape(*batch, n, -1, n_x)
+    still = of.zeros_like(both)
+    gap = of.concatenate([contacts.gap[..., None], still[..., 0]], -1)
+    rows, normals = (of.concatenate([normal, v], -2).reshape(*batch, -1, n_x) for v in (both, still))
+    return rows, normals, gap.reshape(*batch, -1)
 
 
 _LARGE_DRAG = 0.25

@@ -138,12 +138,14 @@ class Actuators:
             yields: (nu,) what motion leaves of a force, see above.
             relative: True if actions of servos count from where they are.
         """
-        length = self._length(x)
-        others = self._constant + self._bias * length + self._damping * self._length(velocity)
-        sides = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
-        # Where the range leaves no such force, the control is at its end.
-        low, high = np.clip(sides, *self.range[:, None]) - length * (self.servo & relative)
-        return low, high
+        length, (low, high) = self._length(x), self.range
+        if np.isfinite(self._force).any():
+            others = self._constant + self._bias * length + self._damping * self._length(velocity)
+            sides = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
+            # Where the range leaves no such force, the control is at its end.
+            low, high = np.clip(sides, *self.range[:, None])
+        length = length * (self.servo & relative)
+        return low - length, high - length
 
     def places(self, x: Array) -> tuple[Array, Array]:
         """Compute how far joints of servos may go (..., nu) within their range, from positions that x begins with."""

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import check_number, check_tensor, describe, did_you_mean
+from difflcs._checks import broadcast_batch, check_number, check_tensor, describe, did_you_mean
 from difflcs._fields import TensorFields
 from difflcs.cost import QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
@@ -194,7 +194,9 @@ class MujocoCost(TensorFields):
         for (_, at), value in zip(self._learned, others, strict=False):
             weights[at] = value
         weight, effort = weights[:, self._squares], weights[0, self._efforts].reshape(-1, self.n_u).sum(0)
-        A, offset, turns = map(of.asarray, self._scene.read(x, self._rows))
+        A, offset, turns = self._scene.read(x, self._rows)
+        if learns:
+            A, offset, turns = map(torch.from_numpy, (A, offset, turns))
         left = offset - self._wanted(of, others[-1] if self.n_goal else None, turns)
         weighted = 2 * weight[..., None] * A[..., None, :, :]  # (..., 2, rows, n_x), of stages and the final state
         Q = A[..., None, :, :].swapaxes(-1, -2) @ weighted
@@ -204,7 +206,7 @@ class MujocoCost(TensorFields):
         fields = {"Q": Q[..., 0, :, :], "R": 2 * of.diag(effort), "Q_final": Q[..., 1, :, :], "q": q[..., 0, :]}
         fields |= {"r": of.zeros(self.n_u), "q_final": q[..., 1, :]}
         fields |= {"constant": constant[..., 1], "constant_stage": constant[..., 0]}
-        tensors = {name: torch.as_tensor(value) for name, value in fields.items()}
+        tensors = fields if learns else {name: torch.from_numpy(np.asarray(v)) for name, v in fields.items()}
         if x.dtype is not torch.float64 or not x.is_cpu:
             tensors = {name: value.to(x.device, x.dtype) for name, value in tensors.items()}
         return QuadraticCost.of_checked(tensors)
@@ -269,7 +271,7 @@ class MujocoCost(TensorFields):
             if row.kind == _TURN:
                 wanted = _rotation_between(of, turns[..., row.where[0], :], wanted, row.reach)
             parts.append(wanted)
-        shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        shape = broadcast_batch([("goal", part.shape[:-1]) for part in parts])
         fits = [p if p.shape[:-1] == shape else of.broadcast_to(p, (*shape, p.shape[-1])) for p in parts]
         return of.concatenate(fits, -1)
 
@@ -414,7 +416,7 @@ class _Scene:
         flat, nv, n, count = x.detach().double().cpu().numpy(), state.nv, len(qpos), len(self.frames)
         batch, flat = flat.shape[:-1], flat.reshape(n, -1)
         place, turn, moves = np.empty((n, count, 3)), np.empty((n, count, 9)), np.empty((n, count, 2, 3, nv))
-        turns = np.empty((n, count, 4))
+        turns, turning = np.zeros((n, count, 4)), {row.where[0] for row in rows if row.kind == _TURN}
         data.mocap_pos[:], data.mocap_quat[:] = source.mocap_pos, source.mocap_quat
         for i in range(n if count else 0):
             data.qpos[:] = qpos[i]
@@ -422,8 +424,10 @@ class _Scene:
             mujoco.mj_comPos(model, data)
             for k, (kind, index) in enumerate(self.frames):
                 _, places, mats, differentiate = _FRAMES[kind]
-                place[i, k], turn[i, k] = getattr(data, places)[index], getattr(data, mats)[index]
-                mujoco.mju_mat2Quat(turns[i, k], turn[i, k])
+                place[i, k] = getattr(data, places)[index]
+                if k in turning:
+                    turn[i, k] = getattr(data, mats)[index]
+                    mujoco.mju_mat2Quat(turns[i, k], turn[i, k])
                 differentiate(model, data, moves[i, k, 0], moves[i, k, 1], index)
         if (tangent := state.tangent(flat[:, :nv])) is not None and count:
             moves = moves @ tangent[:, None, None]
@@ -438,9 +442,10 @@ class _Scene:
                 k = row.where[0]
                 A[:, at, :nv] = turn[:, k].reshape(n, 3, 3).swapaxes(-1, -2) @ moves[:, k, 1]
             else:
-                for sign, k in zip((1, -1), row.where, strict=False):
-                    value[:, at] += sign * place[:, k]
-                    A[:, at, :nv] += sign * moves[:, k, 0]
+                value[:, at], A[:, at, :nv] = place[:, row.where[0]], moves[:, row.where[0], 0]
+                for k in row.where[1:]:
+                    value[:, at] -= place[:, k]
+                    A[:, at, :nv] -= moves[:, k, 0]
         offset = value - (A @ flat[..., None])[..., 0]
         A, offset, turns = (value.reshape(*batch, *value.shape[1:]) for value in (A, offset, turns))
         return A, offset, turns

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs.physics.complementarity import FreeMotion
@@ -89,13 +88,15 @@ class Equality:
         rows = self.read(qpos)
         if rows is None:
             return free
-        A, B, d, response = (v.numpy() for v in free)
+        matrices: Any = free
+        A, B, d, response = matrices
         E = rows.normal if tangent is None else rows.normal @ tangent
         by = _push(response, E)
         along = np.eye(x.shape[1]) - by @ E
         back = by @ ((E @ x[:, :, None])[:, :, 0] - rows.gap)[:, :, None]
         d = (along @ d[..., None] + back)[:, :, 0]
-        return FreeMotion(*(torch.from_numpy(v) for v in (along @ A, along @ B, d, along @ response)))
+        matrices = along @ A, along @ B, d, along @ response
+        return FreeMotion(*matrices)
 
 
 def _push(response: Array, rows: Array) -> Array:

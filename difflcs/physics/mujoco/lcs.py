@@ -228,7 +228,7 @@ class MujocoLCS:
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
             free = self._equality.hold_positions(free, read.x, read.qpos, read.tangent)
-            response = np.broadcast_to(read.to_dofs(free.response.numpy()), (len(read.x), *free.response.shape[-2:]))
+            response = np.broadcast_to(read.to_dofs(free.response), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
         if not rough.all():
@@ -240,7 +240,7 @@ class MujocoLCS:
             FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in zip(free, (2, 2, 1, 2), strict=True))),
             read.batched(read.x),
             read.batched(contacts.friction),
-            torch.full((contacts.gap.shape[1] + rows.gap.shape[1],), self.compliance, dtype=torch.float64),
+            np.full(contacts.gap.shape[1] + rows.gap.shape[1], self.compliance),
             self.cone,
             self.length,
             self.length / self._give,
@@ -277,7 +277,7 @@ class MujocoLCS:
         Contacts that are missing have a gap of `distance`, and zeros.
         """
         read = self._read(x)
-        return read.contacts(read.dof_contacts)
+        return Contacts(*map(torch.from_numpy, read.contacts(read.dof_contacts)))
 
     def control(self, x: Tensor, u: Tensor) -> Tensor:
         """Convert to MuJoCo's `ctrl` (..., nu) actions u (..., n_u) at states x (..., n_x).
@@ -334,7 +334,7 @@ class MujocoLCS:
         moved = self._read_motion(here, self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
-            response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
+            response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
             self._yields = self._actuators.yields(response, 0.0)
         else:
             impulse = self._motion.finish(moved, x).response[0]
@@ -367,9 +367,8 @@ class _States(NamedTuple):
     moved: Any
     doubtful: Any
 
-    def batched(self, value: Any) -> Tensor:
-        """Convert an array (n, ...) to a tensor with the batch dimensions."""
-        value = torch.as_tensor(value)
+    def batched(self, value: Any) -> Any:
+        """Give an array (n, ...) the batch dimensions."""
         return value.reshape(*self.batch, *value.shape[1:])
 
     def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
@@ -394,12 +393,13 @@ class _States(NamedTuple):
         """Convert a response (..., nv, nv) of the positions of the state to one of the degrees of freedom."""
         return response if self.tangent is None else self.tangent @ response @ self.tangent.swapaxes(-1, -2)
 
-    def _of_state(self, rows: Any) -> Tensor:
+    def _of_state(self, rows: Any) -> Any:
         """Convert derivatives (n, ..., nv) by the degrees of freedom to derivatives by the state."""
         if self.tangent is not None:
             rows = rows @ (self.tangent if rows.ndim == 3 else self.tangent[:, None])
-        still = self.x.shape[-1] - rows.shape[-1]
-        return self.batched(np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1))
+        if still := self.x.shape[-1] - rows.shape[-1]:
+            rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1)
+        return self.batched(rows)
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:

@@ -166,7 +166,7 @@ class RowFinder:
         n, nv = place.shape
         if not (self.n_limits or self.n_friction):
             none = np.zeros((n, 0))
-            return Rows(none, np.zeros((n, 0, nv)), none, self._soft.at(np.zeros((n, 0), int)), 0)
+            return Rows(none, np.zeros((n, 0, nv)), none, self._soft, 0)
         normal, gap, bend, tendons = self._limits(qpos, place, middle)
         where = np.arange(n)[:, None]
         chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)

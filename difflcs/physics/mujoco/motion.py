@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs.errors import InvalidInputError
@@ -118,8 +117,8 @@ class QuasiStatic:
         if tangent is not None:
             inverse = np.linalg.inv(tangent)
             response = inverse @ response @ inverse.swapaxes(-1, -2)
-        tensors = (torch.from_numpy(v) for v in (np.eye(nv), self.B.copy(), np.zeros(nv), response))
-        return FreeMotion(*tensors)
+        matrices: Any = np.eye(nv), self.B.copy(), np.zeros(nv), response
+        return FreeMotion(*matrices)
 
 
 def read_each(motion: Any, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
@@ -131,7 +130,8 @@ def read_each(motion: Any, model: Any, data: Any, states: Array, ctrl: Array) ->
     moved = motion.allocate(len(states))
     for i, state in enumerate(states):
         with native(model, data, f"in state {i} of {len(states)}"):
-            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
+            data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq : model.nq + model.nv]
+            data.act[:] = state[model.nq + model.nv :]
             mujoco.mj_fwdPosition(model, data)
             motion.read(i, data, moved, ctrl[i])
     return moved
@@ -463,7 +463,8 @@ class DynamicStep(NamedTuple):
         impulse, response = self.response, np.zeros((n, n_x, n_x))
         both = np.concatenate([h * impulse, impulse], 1)
         response[:, : 2 * nv, :nv] = to_x[:, : 2 * nv, : 2 * nv] @ both @ to_x[:, :nv, :nv].swapaxes(-1, -2)
-        return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
+        matrices: Any = A_x, to_x @ control, d, response
+        return FreeMotion(*matrices)
 
     def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
         """Compute what forces add to the next state (n, n_x, k): ζ gets h S `normal` (n, k, nv), ν S `impulse`."""

@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs.errors import InvalidInputError
@@ -138,7 +137,8 @@ class QuasiDynamic:
             moved, A = inverse @ moved, inverse @ A @ tangent
             response = inverse @ response @ inverse.swapaxes(-1, -2)
         d = x - (A @ x[:, :, None])[:, :, 0] + moved[:, :, -1]
-        return FreeMotion(*(torch.from_numpy(np.ascontiguousarray(v)) for v in (A, moved[:, :, :-1], d, response)))
+        matrices: Any = A, np.ascontiguousarray(moved[:, :, :-1]), d, response
+        return FreeMotion(*matrices)
 
 
 def respond(mass: NDArray[Any], damping: Array, stiffness: Array, seconds: float) -> Array:
@@ -154,4 +154,4 @@ def respond(mass: NDArray[Any], damping: Array, stiffness: Array, seconds: float
 
 def _along(rows: Array, each: Array) -> Array:
     """Sum rowᵀ each row (n, nv, nv) over rows (n, k, nv) with (n, k) or (k,) factors."""
-    return rows.swapaxes(-1, -2) @ (each[..., None] * rows)
+    return rows.swapaxes(-1, -2) @ (each[..., None] * rows) if rows.shape[1] else np.zeros(())

@@ -162,7 +162,8 @@ class MujocoState:
         (qpos, qvel), n = self.to_mujoco(x), x.shape[:-1].numel()
         if self.na:
             act = x.detach().double().cpu().numpy()[..., self.n_x - self.na :].reshape(n, self.na)
-        act = np.broadcast_to(act, (n, act.shape[-1]))
+        else:
+            act = act[None].repeat(n, 0)
         return np.concatenate([qpos.reshape(n, self.nq), qvel.reshape(n, self.nv), act], -1)
 
     def tangent(self, x: Array) -> Array | None:
@@ -213,7 +214,7 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 def _unit(q: Array) -> Array:
     """Normalise quaternions (..., 4), as `mju_normalize4` makes them: no rotation where there is no length."""
-    size = np.linalg.norm(q, axis=-1, keepdims=True)
+    size = np.sqrt((q * q).sum(-1, keepdims=True))  # sooner than np.linalg.norm
     none = size < 1e-15
     return np.where(none, np.array([1.0, 0.0, 0.0, 0.0]), q / np.where(none, 1.0, size))
 
