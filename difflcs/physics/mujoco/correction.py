@@ -35,6 +35,7 @@ _JAMS = 30.0  # times what there is to move: forces of contacts that press again
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
+_HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
 class WholeStep:
@@ -121,7 +122,8 @@ def correct(
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
-    worse = (size(wrong) - size(change)) / (_WORSE * (size(speed) + size(free)) + 1e-9)
+    motion = size(speed) + np.minimum(size(free), _HELD * (size(speed) + size(change)))
+    worse = (size(wrong) - size(change)) / (_WORSE * motion + 1e-9)
     share = energy[:, :, :n_contacts].sum(-1) / total
     # What contacts jam stands with any action.
     pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (size(speed) + size(free)), 1e-300))
