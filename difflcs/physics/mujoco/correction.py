@@ -30,7 +30,7 @@ from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
 _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
-_FARTHER = 0.25  # of the speed before and of what forces do, by which an error is more than that of standing still
+_FARTHER = 0.4  # of the speed before and of what forces do, by which an error is more than that of standing still
 _JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
@@ -153,19 +153,18 @@ def correct(
 def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:
     """Warn where velocities are farther from MuJoCo's than those before the step, with some actions.
 
-    They are (m, n, nv) of m actions at n states, MuJoCo's `after` and without constraints `free` where they are finite,
-    and (n, nv) `before`; inverse_mass is (n, nv, nv).
+    They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
+    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
     """
     mass = np.linalg.inv(inverse_mass)
 
     def size(moved: Array) -> Array:
         return np.sqrt(np.maximum((moved * (mass @ moved[..., None])[..., 0]).sum(-1), 0.0))
 
-    off, alone = predicted - after, np.nan_to_num(size(free - before), nan=0.0, posinf=0.0)
+    off, alone = predicted - after, np.nan_to_num(size(free - before), nan=np.inf).min(0)
     least, change = _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2)), size(after - before)
     alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
-    due = size(before) + np.maximum(alone, _SMALL * alone.max(0))
-    most = change + _FARTHER * due + least
+    most = change + _FARTHER * (size(before) + alone) + least
     wrong = (size(off) > most).any(0)
     if wrong.any():
         worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)
@@ -173,7 +172,7 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
         joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
         warnings.warn(
             f"expected a system as near to MuJoCo's own step as standing still is, also at the ends of the ranges of "
-            f"its actions and half way there, got one that is farther off with such an action in {wrong.sum()} of "
+            f"its actions and between, got one that is farther off with such an action in {wrong.sum()} of "
             f"{len(wrong)} states, most of all joint {joint.name or joint.id!r} of body {body.name or body.id!r}: take "
             f"fewer seconds, or a nominal control (ctrl) near the actions",
             ContactWarning,

@@ -39,6 +39,7 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first that a module is asked for
+_BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -403,7 +404,7 @@ class _States(NamedTuple):
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
-    """Warn where systems are far off at the ends of the ranges of actions, or half way there."""
+    """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
     if step is None or of._whole is None:
         return
     if of._actuators.curved.size or not of._tried:
@@ -416,19 +417,21 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     ends, usual = torch.from_numpy(of._actuators.range)[:, None] - zero, torch.from_numpy(of._actuators.usual)
     other = torch.where(usual > 0, -zero, idle)
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
-    ends = torch.where(ends.isfinite(), ends, likely)
-    ends = torch.cat([ends, torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))])
-    absolute = torch.from_numpy(of._actuators.holds & ~of._actuators.servo)  # far from zero, perhaps
-    u = torch.cat([ends, 0.5 * (ends + idle), torch.where(absolute, 0.0, idle)[None]]).clamp(*of.action_bounds(x))
+    low, high = ends = torch.where(ends.isfinite(), ends, likely)
+    parts = torch.rand(_BETWEEN, 1, of.n_u, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
+    turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
+    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*of.action_bounds(x))
     m, nv = len(u), of.state.nv
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
     states = np.tile(read.states[some], (m, 1))
     after = of._whole.simulate(of._places, states, ctrl)
-    free = of._motion.simulate(of._places, states, ctrl, np.ones(len(states), dtype=bool))
+    unstable, ways = np.tile(read.moved.unstable[some], m), (True, False) if of._model.neq else (True,)
+    free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
-    at, to, alone = (v.reshape(m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
-    warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], of._model)
+    at, to, alone = (v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
+    warn_of_wrong(at[0], to[0], alone, step.velocity[some], step.inverse_mass[some], of._model)
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

@@ -164,7 +164,9 @@ class Dynamic:
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
-        self._native = {steps: self.describe(steps, self.flags) for steps in (self.simulated, self.finer)}
+        both, loose = (self.simulated, self.finer), flags("CONSTRAINT")
+        self._native = {steps: self.describe(steps, self.flags) for steps in both}
+        self._loose = {steps: self.describe(steps, loose) for steps in both} if model.neq else self._native
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
@@ -200,18 +202,22 @@ class Dynamic:
                     secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
 
-    def simulate(self, places: Places, states: Array, ctrl: Array, unstable: NDArray[np.bool_]) -> Array:
+    def simulate(
+        self, places: Places, states: Array, ctrl: Array, unstable: NDArray[np.bool_], loose: bool = False
+    ) -> Array:
         """Return ζ, ν and the change of activation (n, n_x) after a step at controls (n, nu), see `read`.
 
-        What becomes fast is simulated in finer steps as well, as drives may be stiffer with another action.
+        What becomes fast is simulated in finer steps as well, as drives may be stiffer with another action. Where it is
+        `loose`, there are no equality constraints either.
         """
+        described = self._loose if loose else self._native
         after = np.full((len(states), 2 * self.model.nv + self.model.na), np.inf)
         for steps, some in ((self.simulated, ~unstable), (self.finer, None)):
             some = ~(np.abs(after).max(1) < _FAST_MOTION) if some is None else some
             if some.any():
                 part = after[some]
                 taken = places.take(len(part)), states[some], ctrl[some], part
-                places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
+                places.check(_mujoco.simulate(library(), described[steps], *taken), len(part))
                 after[some] = part
         return after
 
