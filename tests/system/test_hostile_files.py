@@ -275,9 +275,9 @@ def test_random_damage(record):
 def test_any_value_in_any_setting(tmp_path, method):
     run = make_run(tmp_path / "run", method=method)
     whole = run.config()
-    rng = random.Random(0)
+    rng = random.Random(method)  # most settings are those of several methods: each draws others
     for place in paths_of(whole["config"], ("config",)):
-        for value in (True, *rng.sample(VALUES, 5)):
+        for value in (True, *rng.sample(VALUES, 2)):
             write(run.path / "config.json", put(whole, place, value))
             accepted = loads_or_refuses(stored_config, run)
             stored = reduce(lambda part, key: part[key], place, whole)

@@ -3,6 +3,7 @@
 Plans and gradients of every form of problem, and that elements leave each other alone: tests/conformance.
 """
 
+import functools
 from dataclasses import replace
 
 import pytest
@@ -40,10 +41,21 @@ PROBLEMS = {
 }
 
 
+@pytest.fixture(scope="module")
+def solved(build):
+    """Each problem and its plans, made once."""
+
+    @functools.cache
+    def get(name):
+        problem = PROBLEMS[name](build)
+        return problem, BATCHED.solve(problem, None)
+
+    return get
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_the_native_adjoint_equals_the_reference(build, name):
-    problem, generator = PROBLEMS[name](build), torch.Generator().manual_seed(3)
-    result = BATCHED.solve(problem, None)
+def test_the_native_adjoint_equals_the_reference(solved, name):
+    (problem, result), generator = solved(name), torch.Generator().manual_seed(3)
     shapes = [v.shape for v in result.primal[:3]] + [(problem.batch,)]
     grads = tuple(torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
     ours = BATCHED.vjp(problem, result, grads, result.solved)
@@ -54,25 +66,24 @@ def test_the_native_adjoint_equals_the_reference(build, name):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_the_native_residual_is_that_of_kkt(build, name):
+def test_the_native_residual_is_that_of_kkt(solved, name):
     """Of plans that are far from a solution, where it is no rounding, and at a solution below its limit."""
-    problem = PROBLEMS[name](build)
+    problem, result = solved(name)
     rough = BatchedBackend(max_iter=1, effort="fast", homotopy=1.0, shrink=1e-3).solve(problem, None)
     far = rough.status == Status.MAX_ITER
     residual = kkt.residual(problem, rough.primal, kkt.multipliers(problem, rough.primal))
     torch.testing.assert_close(rough.kkt_residual[far], residual[far], rtol=1e-6, atol=0)
     assert int(far.sum()) >= 5
     assert float(residual[far].min()) > kkt.CERTIFIED
-    solved = BATCHED.solve(problem, None)
-    assert float(solved.kkt_residual[solved.solved].max()) <= kkt.CERTIFIED
+    assert float(result.kkt_residual[result.solved].max()) <= kkt.CERTIFIED
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_a_problem_alone_has_the_numbers_that_it_has_among_others(build, name):
+def test_a_problem_alone_has_the_numbers_that_it_has_among_others(solved, name):
     """Alone it is solved by other code, see difflcs/_native/single_lane.hpp."""
-    problem = PROBLEMS[name](build)
-    for backend in (BATCHED, replace(BATCHED, max_iter=2, restarts=1)):  # the second is not finished
-        cold = backend.solve(problem, None)
+    problem, result = solved(name)
+    unfinished = replace(BATCHED, max_iter=2, restarts=1)
+    for backend, cold in ((BATCHED, result), (unfinished, unfinished.solve(problem, None))):
         guess = type(cold.primal)(*(0.9 * value for value in cold.primal))
         warm = backend.solve(problem, guess)
         for i in range(0, problem.batch, 4):
