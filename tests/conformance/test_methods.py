@@ -76,7 +76,8 @@ def finished(tmp_path_factory) -> Any:
 
     def get(name: str) -> RunDirectory:
         if name not in runs:
-            runs[name] = train(make_config(name), tmp_path_factory.mktemp(name) / "run", task=task_of(name))
+            path = str(tmp_path_factory.mktemp(name) / "run")  # directories may be strings
+            runs[name] = train(make_config(name), path, task=task_of(name))
         return runs[name]
 
     return get
@@ -109,12 +110,6 @@ def make_trainer():
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
-
-
-def test_directories_may_be_strings(tmp_path, finished):
-    run = train(make_config("violation"), str(tmp_path / "run"), init=str(finished("violation").path))
-    assert run.path == tmp_path / "run"
-    assert RunDirectory.open(str(tmp_path / "run")).rows() == run.rows()
 
 
 def test_it_trains_and_says_what_it_did(name, finished):
@@ -179,7 +174,7 @@ def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished
             break
         except KeyboardInterrupt:
             interrupted += 1
-    run = RunDirectory.open(path)
+    run = RunDirectory.open(str(path))
     assert interrupted == len(whole.rows()) - 1
     assert same(load_checkpoint(run.checkpoints), load_checkpoint(whole.checkpoints))
     assert (run.model / "model.safetensors").read_bytes() == (whole.model / "model.safetensors").read_bytes()
@@ -304,7 +299,7 @@ def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
     for which, error in (("right", None), ("wrong", "init: expected a model with n_x=2")):
         out = tmp_path / f"from-{which}"
         if takes and error is None:
-            run = train(make_config(name), out, task=task_of(name), init=tmp_path / which)
+            run = train(make_config(name), out, task=task_of(name), init=str(tmp_path / which))
             assert load_model(run.path).n_lam == 1
             continue
         with pytest.raises(InvalidInputError, match=error if takes else f"none with method {name}"):

@@ -5,8 +5,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
-from gymnasium.utils.env_checker import check_env
 
 import difflcs_envs  # noqa: F401
 from difflcs.rl.tasks import get_task
@@ -20,11 +18,6 @@ ID = "difflcs/HandTurnObject-v0"
 
 def make(name="cube", **arguments):
     return gymnasium.make(ID, object=name, **arguments).unwrapped
-
-
-def test_checkers():
-    check_env(make("house"), skip_render_check=True)
-    check_mujoco_reset_state(make())
 
 
 @pytest.mark.parametrize("name", OBJECTS)

@@ -34,7 +34,7 @@ def assert_same(one, other):
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-@pytest.mark.parametrize(("env_id", "arguments"), TASKS)
+@pytest.mark.parametrize(("env_id", "arguments"), [*TASKS, ("difflcs/HandTurnObject-v0", {"object": "house"})])
 def test_checkers(env_id, arguments):
     env = gymnasium.make(env_id, **arguments)
     with warnings.catch_warnings():

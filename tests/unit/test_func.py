@@ -1,4 +1,4 @@
-"""The layer under torch.func and torch.compile: the numbers of plain calls, or an error. Jacobians: test_transforms."""
+"""The layer under torch.func: the numbers of plain calls, or an error. Jacobians and torch.compile: test_transforms."""
 
 import warnings
 
@@ -7,7 +7,7 @@ import torch
 from torch.autograd.functional import jacobian
 from torch.func import grad, jvp, vmap
 
-from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
+from difflcs import LCSMPCLayer, LCSParams, Status
 from difflcs import errors as e
 from difflcs.mpc import Primal
 
@@ -174,27 +174,3 @@ def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
             p.mul_(1.1)
     assert torch.equal(plan.complementarity(), before[0])
     assert torch.equal(plan.dynamics_residual(), before[1])
-
-
-@pytest.mark.slow
-# Where warnings are errors, the compiler trips over one of its own, which it otherwise hides.
-@pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
-def test_compiled_code_that_contains_a_layer_is_eager_code(build, layer, x0):
-    def loss(x):
-        return (2 * layer(torch.sin(x)).action).square()
-
-    plain, compiled = x0.clone().requires_grad_(), x0.clone().requires_grad_()
-    expected = loss(plain)
-    expected.sum().backward()
-    weights = {k: p.grad.clone() for k, p in layer.named_parameters()}
-    layer.zero_grad()
-    found = torch.compile(loss, backend="eager")(compiled)
-    found.sum().backward()
-    assert torch.equal(found, expected)
-    assert torch.equal(compiled.grad, plain.grad)
-    assert all(torch.equal(p.grad, weights[k]) for k, p in layer.named_parameters())
-    whole = torch.compile(layer, backend="eager")
-    solution = whole(x0, u_max=0.05)
-    assert isinstance(solution, MPCSolution)
-    assert torch.equal(solution.u, layer(x0, u_max=0.05).u)
-    torch.compiler.reset()

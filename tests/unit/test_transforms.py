@@ -5,7 +5,7 @@ import torch
 from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, jacrev, vmap
 
-from difflcs import LCSMPCLayer, LCSParams, LCSSequence, Status, prediction_loss, solve_lcp, violation_loss
+from difflcs import LCSMPCLayer, LCSParams, LCSSequence, MPCSolution, Status, prediction_loss, solve_lcp, violation_loss
 from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
 
 COUNT = 6
@@ -263,6 +263,7 @@ def test_steps_and_rollouts_of_records_are_mapped(build):
 @pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
 def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, data):
     model, params = build.model(seed=3), build.params(seed=3, batch=(COUNT,))
+    layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
     fields, (F, q), (x, u, x_next) = params.tensors(), lcps, data
 
     def function(q, x):
@@ -274,6 +275,7 @@ def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, 
             2 * violation_loss(model, 2 * x, u, x_next),
             2 * violation_loss(params, 2 * x, u, x_next, "auto"),
             2 * prediction_loss(model, 2 * x, u, x_next),
+            (2 * layer(torch.sin(0.2 * x)).action).square(),
         )
 
     torch.compiler.reset()
@@ -282,5 +284,9 @@ def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, 
         leaves = [v.clone().requires_grad_() for v in (q, x)]
         values = way(*leaves)
         total = sum((k + 1) * v.sum() for k, v in enumerate(values))
-        results.append([v.detach() for v in (*values, *torch.autograd.grad(total, leaves))])
+        results.append([v.detach() for v in (*values, *torch.autograd.grad(total, [*leaves, *layer.parameters()]))])
     torch.testing.assert_close(*results, rtol=1e-12, atol=1e-14)
+    plan = torch.compile(layer, backend="eager")(0.2 * x, u_max=0.05)
+    assert isinstance(plan, MPCSolution)
+    assert torch.equal(plan.u, layer(0.2 * x, u_max=0.05).u)
+    torch.compiler.reset()
