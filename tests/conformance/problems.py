@@ -60,7 +60,11 @@ class Problem:
 
     def element(self, i):
         """Inputs of one element, as a batch of one."""
-        return {k: v if self.shared(k) else v[i : i + 1] for k, v in self.tensors.items()}
+        return self.part(slice(i, i + 1)).tensors
+
+    def part(self, index):
+        """Some of the elements."""
+        return self.changed(**{k: v if self.shared(k) else v[index] for k, v in self.tensors.items()})
 
     def full(self):
         """Every input of every element at every stage (batch, stages, …); x0 without stages."""

@@ -224,6 +224,12 @@ def test_an_inner_problem_that_was_given_up_on_is_solved_by_a_proximal_step(monk
     np.testing.assert_allclose(losses.minimise_over_orthant(Q, q), [[0.5, 0.0]], atol=1e-8)
 
 
+def test_a_singular_inner_problem_is_solved_to_its_conditions():
+    Q, q = np.ones((2, 2)), np.array([[-1.0, -1.0], [-2.0, 1.0]])
+    z = losses.minimise_over_orthant(Q, q)
+    np.testing.assert_allclose(np.minimum(z, z @ Q + q), 0, atol=1e-9)
+
+
 @pytest.mark.parametrize("gamma", ["Auto", "0.1", None, True, torch.tensor(0.1)])
 def test_other_words_for_gamma_are_refused(build, data, gamma):
     with pytest.raises(DTypeError, match="gamma: expected a number, got"):
