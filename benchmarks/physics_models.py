@@ -160,12 +160,12 @@ def median(values: list[float]) -> float | None:
 
 
 @torch.no_grad()
-def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, Any] | None:
-    """Errors by kind, and the time of a state, with as many contacts as a `ContactWarning` asks for.
+def measure(model: Any, o: Options, asked: dict[str, int] | None = None) -> dict[str, Any] | None:
+    """Errors by kind, and the time of a state, with as many contacts and limits as a `ContactWarning` asks for.
 
     None where every simulation of the model diverges.
     """
-    module = MujocoLCS(model, motion="dynamic", seconds=count_steps(model) * model.opt.timestep, contacts=contacts)
+    module = MujocoLCS(model, motion="dynamic", seconds=count_steps(model) * model.opt.timestep, **(asked or {}))
     random, nv = np.random.default_rng(o.seed), model.nv
     states = roam(model, o.states, random)
     if not states:
@@ -182,13 +182,13 @@ def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, An
     zeros, actions = torch.tensor(np.array(nominal)), torch.tensor(np.array(ctrl))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        module.params(x[:1])  # what is done once
+        module.params(x)  # what is done once
         start = time.process_time()
         system = module.params(x)
         seconds = (time.process_time() - start) / len(x)
-    more = [int(found[1]) for w in said if (found := re.search(r"pass contacts=(\d+)", str(w.message)))]
-    if more and contacts is None:
-        return measure(model, o, max(more))
+    more = {name: int(n) for w in said for name, n in re.findall(r"pass (contacts|limits)=(\d+)", str(w.message))}
+    if more and asked is None:
+        return measure(model, o, more)
     for w in said:
         warnings.warn(w.message, stacklevel=1)
     predicted = system.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy()
