@@ -167,7 +167,7 @@ class HandPolicy:
     def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
         s = settings
         self.twin, self.place, model = copy.copy(model), place, copy.copy(model)
-        self.twin.opt.timestep, self.twin.opt.impratio = SECONDS / TRIALS, 1.0
+        self.twin.opt.timestep, self.twin.opt.impratio, self.twin.opt.tolerance = SECONDS / TRIALS, 1.0, 1e-5
         self.twin.geom_condim[:] = np.minimum(self.twin.geom_condim, 4)  # nothing rolls far
         self.tried = mujoco.MjData(self.twin)
         model.body_inertia[model.body("obj").id] *= s.inertia
@@ -204,6 +204,8 @@ class HandPolicy:
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
         self.geom, self.spots = model.geom("obj").id, np.zeros((4, 3))
         self.aim(goal)
+        self.mpc.step(self.module.observe(data), np.concatenate([place, goal, np.zeros(12)]))  # the first takes longer
+        self.mpc.reset()
 
     def aim(self, goal: np.ndarray) -> None:
         """Turn the object to this quaternion from now on."""
