@@ -131,6 +131,7 @@ def test_it_trains_and_says_what_it_did(name, finished):
     assert rows[-1]["evaluation_goals"] == "4"
     spent = sum_seconds(rows)
     assert set(spent) == {c.removesuffix("_seconds") for c in rows[0] if c.endswith("_seconds")}
+    assert min(spent.values()) > 0
     files = {path.name for path in run.path.iterdir()}
     assert files == {"config.json", "log.csv", "tensorboard", "checkpoints", "model"}
     assert run.finished()
