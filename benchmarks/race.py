@@ -422,6 +422,7 @@ def globally(o: Options) -> dict[str, dict]:
     backends = {
         "`batched`": (BatchedBackend(), RELAXATION),
         "`batched`, λ·s = 1e-7": (BatchedBackend(), 1e-7),
+        "`batched`, λ·s = 1e-8": (BatchedBackend(), 1e-8),
         "`best`": (BatchedBackend(effort="best"), RELAXATION),
         "`ipopt`": (IpoptBackend(workers=1), RELAXATION),
     }

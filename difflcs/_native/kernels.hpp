@@ -63,11 +63,11 @@ struct MpcBatch {
 struct MpcStart {
   // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
   bool released;
-  bool gauss_newton;  // without the second derivative of the forces
-  double first;       // if released: first relaxation, in parts of the square of the mean gap of the contacts then
-  double at_least;    // first relaxation, whatever the problem's scale
-  int64_t explore;    // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
-  double needed;      // if explored: it is left earlier where its steps gain too little to come below this objective
+  bool gauss_newton;      // without the second derivative of the forces
+  double first;           // if released: first relaxation, in parts of the square of the mean gap of the contacts then
+  double at_least;        // first relaxation, whatever the problem's scale
+  int64_t explore;        // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
+  double needed = kHuge;  // if explored: left earlier where its steps gain too little to come below this objective
 };
 
 // Options and outputs of the solver.

@@ -48,6 +48,11 @@ constexpr double kRoundingLeft = 1e-9;
 // Steps that each gain as much as the last one must not be enough for a start that is left early.
 constexpr double kHope = 100.0;
 
+// After this many steps at the target a plan creeps along the kinks of hard contact. It then returns to contact softer by
+// these factors, once to each, and follows the homotopy down anew.
+constexpr int64_t kCreeping = 50, kReturns = 3;
+constexpr double kSofter[kReturns] = {1e3, 1e4, 1e5};
+
 template <class T>
 struct Progress {
   using Multipliers = Matrix<Vec, 0, 0>;
@@ -67,6 +72,7 @@ struct Progress {
     int64_t stalled = 0;        // consecutive steps of the multipliers that hardly helped
     double gained = 0;          // by the last step
     bool weight_reset = false;  // see kRoundingLeft
+    int64_t returns = 0;        // to softer contact, see kCreeping
     int64_t without_gain = 0;   // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
@@ -330,6 +336,11 @@ struct Progress {
         eps[l] = eps[l] * shrink > target ? eps[l] * shrink : target;
         a.in_stage = 0;
         a.failures = 0;
+        needs_rollout[l] = -1;
+      } else if (eps[l] <= target && a.in_stage >= kCreeping && a.returns < kReturns && n.l() > 0) {
+        eps[l] = target * kSofter[a.returns++];
+        a.in_stage = a.failures = a.without_gain = 0;
+        reg = 0;
         needs_rollout[l] = -1;
       }
     }

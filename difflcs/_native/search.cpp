@@ -54,12 +54,10 @@ constexpr double kLonger = 1000.0;
 // Starts from the kSoftPulses-th on, which are pulses, follow a homotopy from contact so many powers of ten softer.
 constexpr int64_t kSoftPulses = 8;
 constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
-// Starts are compared at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plans
-// that may win are then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan
-// where it begins.
+// The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
+// finds is then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan where it
+// begins.
 constexpr double kSoft = 1e-5, kSofter = 1000.0;
-// By this part of the best cost a start may lie behind there, and still win at the problem's own relaxation.
-constexpr double kBehind = 0.3;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
@@ -191,13 +189,15 @@ MpcSolve solver_options(const MpcEffort& effort, const MpcPlans& out) {
 // A problem that begins where its homotopy ends, as a guess does.
 MpcStart at_target(const MpcBatch& b) { return {false, false, 0.0, b.relaxation}; }
 
-// The relaxation at which starts are compared.
-double comparison(const MpcBatch& b) { return std::max(b.relaxation, std::min(kSoft, kSofter * b.relaxation)); }
+// The relaxation of the search.
+double softer(const MpcBatch& b) {
+  return b.n_lam == 0 ? b.relaxation : std::max(b.relaxation, std::min(kSoft, kSofter * b.relaxation));
+}
 
 MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
   if (b.n_lam == 0 && b.barrier == 0) return {s.released, false, 0.0, b.relaxation};  // nothing is relaxed
   return {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first,
-          comparison(b) * std::max(effort.homotopy, 1.0)};
+          b.relaxation * std::max(effort.homotopy, 1.0)};
 }
 
 MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
@@ -214,11 +214,8 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   return p;
 }
 
-// By which part of the cost of a plan others may lie behind where they are compared.
-double behind(const MpcBatch& b) { return comparison(b) > b.relaxation ? kBehind : 0.0; }
-
 // The objective below which a job must come that is to be better than a plan, by more than kEqual.
-double needed(const MpcBatch& b, double objective) { return objective + (behind(b) - kEqual) * std::abs(objective); }
+double needed(double objective) { return objective - kEqual * std::abs(objective); }
 
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
@@ -309,11 +306,18 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
-  const bool once = effort.starts == 1 && (batch.n_lam == 0 || comparison(batch) == batch.relaxation);
-  const auto way = once ? &MpcSearch::solve_once : &MpcSearch::search;
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
-  for (int64_t first = 0; first < batch.count; first += chunk)
-    (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
+  MpcBatch searched = batch;
+  searched.relaxation = softer(batch);
+  const bool hard = searched.relaxation > batch.relaxation;
+  for (int64_t first = 0; first < batch.count; first += chunk) {
+    const int64_t count = std::min(chunk, batch.count - first);
+    if (effort.starts == 1)
+      solve_once(searched, guess, effort, out, runner, first, count, hard ? kExplore : 0);
+    else
+      search(searched, guess, effort, out, runner, first, count);
+    if (hard) harden(batch, effort, out, runner, first, count);
+  }
   for (const bool pivot : {false, true})
     if (!runner.stopped()) retry_failed(batch, effort, out, runner, pivot);
   if (batch.n_c > 0) judge_constraints(batch, solver_options(effort, out), runner);
@@ -327,7 +331,6 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   if (s.actions == Actions::pulse && start >= kSoftPulses)
     tried.start[job].at_least *= power_of_ten(kSoftened, kSoftenedMore, uniform(effort.seed, start, -1));
   tried.start[job].explore = s.explore;
-  tried.start[job].needed = kHuge;
   double* u = tried.u.data() + job * n.u;
   double largest = 1.0;
   for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
@@ -355,7 +358,6 @@ void MpcSearch::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data() + first;
-  jobs.relaxation = comparison(batch);
   MpcSolve o = solver_options(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u;
   o.start = tried.start.data() + first;
@@ -365,18 +367,18 @@ void MpcSearch::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   }
   o.gained = tried.gained.data() + first;
   run(jobs, o, runner);
-  for (int64_t j = first; j < first + count && jobs.relaxation > batch.relaxation; j++)  // solved there alone
-    if (solved(tried.status[j])) tried.status[j] = int8_t(Status::max_iter);
 }
 
-// Solves elements [first, first + count) from one start.
+// Solves elements [first, first + count) from one start, or makes the first `steps` steps of that.
 void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-                           Runner& runner, int64_t first, int64_t count) {
+                           Runner& runner, int64_t first, int64_t count, int64_t steps) {
   const Sizes n(batch);
   const MpcPlans to = shifted(batch, out, first);
   tried.resize(batch, 0);
   tried.element.resize(count);
-  tried.start.assign(count, guess.u ? at_target(batch) : beginning(start_of(0), batch, effort));
+  MpcStart start = guess.u ? at_target(batch) : beginning(start_of(0), batch, effort);
+  start.explore = steps;
+  tried.start.assign(count, start);
   for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element ? batch.element[first + e] : first + e;
   MpcBatch jobs = batch;
   jobs.count = count;
@@ -425,14 +427,13 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
       if (from_guess) {
         tried.start[j] = at_target(batch);
         tried.start[j].explore = kExplore;
-        tried.start[j].needed = kHuge;
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
       } else {
         begin(batch, effort, begun + (j - before) / elements - shift, j, best[e]);
       }
-      if (begun >= kFixed) tried.start[j].needed = needed(batch, tried.objective[best[e]]);
+      if (begun >= kFixed) tried.start[j].needed = needed(tried.objective[best[e]]);
     }
     explore(batch, effort, runner, before, jobs, from_guess && whole);
     for (int64_t j = before; j < before + jobs; j++) {
@@ -527,7 +528,7 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 
 // Whether a job may become better than a plan, and does not approach the same one.
 bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
-  if (!(tried.objective[job] - tried.gained[job] <= objective + behind(batch) * std::abs(objective))) return false;
+  if (!(tried.objective[job] - tried.gained[job] <= objective)) return false;
   const Sizes n(batch);
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(batch, tried.element[job], i);
@@ -536,6 +537,25 @@ bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, d
     if (std::abs(here - u[i]) > kSame * range) return true;
   }
   return false;
+}
+
+// Solves the plans that were found with softer contact at the problem's own relaxation.
+void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+                       int64_t first, int64_t count) {
+  const MpcPlans to = shifted(batch, out, first);
+  tried.resize(batch, count);
+  for (int64_t e = 0; e < count; e++) {
+    copy_plan(Sizes(batch), to, e, tried.plans(), e);
+    tried.element[e] = batch.element ? batch.element[first + e] : first + e;
+    if (solved(to.status[e])) to.status[e] = int8_t(Status::max_iter);  // if no time is left
+  }
+  const auto wanted = [&](int64_t e) { return !runner.stopped() && to.status[e] != int8_t(Status::infeasible); };
+  const int64_t kept = solve_tried(batch, effort, runner, wanted);
+  for (int64_t i = 0; i < kept; i++) {
+    const int64_t e = origin[i];
+    to.iterations[e] += finished.iterations[i];
+    if (finished.status[i] != kUnreached) copy_plan(Sizes(batch), finished.plans(), i, to, e);
+  }
 }
 
 // Sets the first actions of a job to those of a plan, varied.
@@ -586,9 +606,9 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
     for (int64_t j = 0; j < all; j++) {
       const int64_t e = tried.owner[j] = live[j % elements];
       tried.element[j] = batch.element ? batch.element[first + e] : first + e;
-      tried.start[j] = {false, false, 0.0, comparison(batch)};
+      tried.start[j] = at_target(batch);
       tried.start[j].explore = kExploreFar;
-      tried.start[j].needed = needed(batch, out.objective[e]);
+      tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       vary(batch, effort, few && v == varied - 1 ? kSoftest : kVaried * round + v, out.u + e * n.u, j);
     }
@@ -623,7 +643,7 @@ void MpcSearch::retry_failed(const MpcBatch& batch, const MpcEffort& effort, con
   tried.resize(batch, count);
   for (int64_t i = 0; i < count; i++) {
     tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
-    tried.start[i] = {false, false, 0.0, comparison(batch) * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
+    tried.start[i] = {false, false, 0.0, softer(batch) * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;
   jobs.count = count;

@@ -72,7 +72,7 @@ class MpcSearch {
   void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const;
   void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const;
   void solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-                  Runner& runner, int64_t first, int64_t count);
+                  Runner& runner, int64_t first, int64_t count, int64_t steps);
   void search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
               Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
@@ -82,6 +82,8 @@ class MpcSearch {
               Runner& runner, int64_t first, int64_t count);
   template <class Wanted>
   int64_t solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted);
+  void harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
+              int64_t count);
   bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
   void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job);
   void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,

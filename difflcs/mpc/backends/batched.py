@@ -51,7 +51,8 @@ class BatchedBackend(Backend):
     The problem has local optima. `effort` says how many starts are tried: the feedback law of the plant without
     contact, along a long homotopy and a short one; the largest actions forth and then back, and back and then forth,
     which find contacts that are far; random pulses, a push and a brake of each action, or swings to and fro. Starts are
-    compared after a few steps at the relaxation, and only those that may still win are solved to the end. The starts of
+    compared after a few steps at the relaxation, or at 1e-5 if that is softer, and only those that may still win are
+    solved to the end; at a harder relaxation the plan that is found is solved once more. The starts of
     an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
     long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. A
     local search follows, unless they agree: the best plan is shifted or stretched in time, pushed, or solved again from
