@@ -277,7 +277,7 @@ void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
   std::fill_n(solve.iterations, batch.count, 0);
   Solving context{kernels, batch, solve, 0};
   runner.run(
-      batch.count, kernels.mpc_workspace(batch), false,
+      batch.count, kernels.mpc_workspace(batch), solve.max_iter == 0,  // which takes no time
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
         const bool large = c.batch.n_x + c.batch.n_u >= kAlone || c.batch.n_lam >= kAloneForces;
@@ -547,14 +547,22 @@ void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const Mpc
   for (int64_t e = 0; e < count; e++) {
     copy_plan(Sizes(batch), to, e, tried.plans(), e);
     tried.element[e] = batch.element ? batch.element[first + e] : first + e;
-    if (solved(to.status[e])) to.status[e] = int8_t(Status::max_iter);  // if no time is left
   }
-  const auto wanted = [&](int64_t e) { return !runner.stopped() && to.status[e] != int8_t(Status::infeasible); };
-  const int64_t kept = solve_tried(batch, effort, runner, wanted);
-  for (int64_t i = 0; i < kept; i++) {
-    const int64_t e = origin[i];
-    to.iterations[e] += finished.iterations[i];
-    if (finished.status[i] != kUnreached) copy_plan(Sizes(batch), finished.plans(), i, to, e);
+  const auto wanted = [&](int64_t e) {
+    return tried.status[e] != int8_t(Status::infeasible) && tried.objective[e] < std::numeric_limits<double>::max();
+  };
+  for (const bool over : {false, true}) {  // without time they are only executed at the relaxation
+    if (over && !runner.stopped()) break;
+    MpcEffort left = effort;
+    if (over) left.max_iter = 0;
+    const int64_t kept = solve_tried(batch, left, runner, wanted);
+    for (int64_t i = 0; i < kept; i++) {
+      if (finished.status[i] == kUnreached) continue;
+      const int64_t e = origin[i];
+      to.iterations[e] += finished.iterations[i];
+      copy_plan(Sizes(batch), finished.plans(), i, to, e);
+      tried.status[e] = kUnreached;
+    }
   }
 }
 

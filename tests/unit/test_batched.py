@@ -65,9 +65,11 @@ def test_threads_change_nothing_not_even_summed_gradients(build):
 @pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
 @pytest.mark.parametrize("effort", ["fast", "default"])
 @pytest.mark.parametrize("time_limit", [1e-9, 1e-4])
-def test_a_plan_out_of_time_is_executed_at_the_relaxation(build, effort, time_limit):
+@pytest.mark.parametrize("relaxation", [1e-5, 1e-7])
+def test_a_plan_out_of_time_is_executed_at_the_relaxation(build, effort, time_limit, relaxation):
     x0, goal = data(build, 1)
     mpc = pushing(build, 5, effort=effort, time_limit=time_limit, on_failure="mask")
+    mpc.relaxation = relaxation
     plan = mpc(x0, goal)
     x, lam = plan.problem.rollout(plan.u)
     torch.testing.assert_close(plan.x, x, rtol=1e-7, atol=1e-9)
