@@ -37,7 +37,7 @@ def test_an_environment_of_an_id():
     gymnasium.register("difflcs-tests/Slide-v0", entry_point=Slide)
     task = make_task(env="difflcs-tests/Slide-v0", env_kwargs={"size": 2})
     assert isinstance(task.make_env().unwrapped, Slide)
-    envs = task.make_envs(2)
+    envs = task.make_envs(2, threads=3)  # which it does not take
     assert envs.reset(seed=[0, 1])[0]["state"].shape == (2, 2)
     envs.close()
 
