@@ -308,7 +308,8 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
   MpcBatch searched = batch;
-  searched.relaxation = softer(batch);
+  const bool near = effort.starts == 1 && guess.lam;  // a plan with its forces, of the step before
+  searched.relaxation = near ? batch.relaxation : softer(batch);
   const bool hard = searched.relaxation > batch.relaxation;
   for (int64_t first = 0; first < batch.count; first += chunk) {
     const int64_t count = std::min(chunk, batch.count - first);
