@@ -48,8 +48,8 @@ constexpr double kRoundingLeft = 1e-9;
 // Steps that each gain as much as the last one must not be enough for a start that is left early.
 constexpr double kHope = 100.0;
 
-// After this many steps at the target a plan creeps along the kinks of hard contact. It then returns to contact softer by
-// these factors, once to each, and follows the homotopy down anew.
+// After this many steps at the target a plan without constraints creeps along the kinks of hard contact. It then goes
+// back to contact softer by these factors, once to each, and follows the homotopy down anew.
 constexpr int64_t kCreeping = 50, kReturns = 3;
 constexpr double kSofter[kReturns] = {1e3, 1e4, 1e5};
 
@@ -337,7 +337,7 @@ struct Progress {
         a.in_stage = 0;
         a.failures = 0;
         needs_rollout[l] = -1;
-      } else if (eps[l] <= target && a.in_stage >= kCreeping && a.returns < kReturns && n.l() > 0) {
+      } else if (eps[l] <= target && a.in_stage >= kCreeping && a.returns < kReturns && n.l() > 0 && n.c() == 0) {
         eps[l] = target * kSofter[a.returns++];
         a.in_stage = a.failures = a.without_gain = 0;
         reg = 0;
