@@ -54,8 +54,9 @@ struct MpcBatch {
   int64_t version;
 
   // Field `which` of a problem at stage k.
+  int64_t element_of(int64_t problem) const { return element ? element[problem] : problem; }
   const double* at(int which, int64_t problem, int64_t k = 0) const {
-    return input[which] + (element ? element[problem] : problem) * stride[which] + k * step[which];
+    return input[which] + element_of(problem) * stride[which] + k * step[which];
   }
 };
 

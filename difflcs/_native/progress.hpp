@@ -51,7 +51,7 @@ constexpr double kHope = 100.0;
 // After this many steps at the target a plan without constraints creeps along the kinks of hard contact. It then goes
 // back to contact softer by these factors, once to each, and follows the homotopy down anew.
 constexpr int64_t kCreeping = 50, kReturns = 3;
-constexpr double kSofter[kReturns] = {1e3, 1e4, 1e5};
+constexpr double kBack[kReturns] = {1e3, 1e4, 1e5};
 
 template <class T>
 struct Progress {
@@ -338,7 +338,7 @@ struct Progress {
         a.failures = 0;
         needs_rollout[l] = -1;
       } else if (eps[l] <= target && a.in_stage >= kCreeping && a.returns < kReturns && n.l() > 0 && n.c() == 0) {
-        eps[l] = target * kSofter[a.returns++];
+        eps[l] = target * kBack[a.returns++];
         a.in_stage = a.failures = a.without_gain = 0;
         reg = 0;
         needs_rollout[l] = -1;

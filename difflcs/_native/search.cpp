@@ -380,7 +380,7 @@ void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
   MpcStart start = guess.u ? at_target(batch) : beginning(start_of(0), batch, effort);
   start.explore = steps;
   tried.start.assign(count, start);
-  for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element ? batch.element[first + e] : first + e;
+  for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element_of(first + e);
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data();
@@ -422,7 +422,7 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = before; j < before + jobs; j++) {
       const int64_t e = live[(j - before) % elements];
       tried.owner[j] = e;
-      tried.element[j] = batch.element ? batch.element[first + e] : first + e;
+      tried.element[j] = batch.element_of(first + e);
       tried.status[j] = kUnreached;
       tried.iterations[j] = 0;
       if (from_guess) {
@@ -547,7 +547,7 @@ void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const Mpc
   tried.resize(batch, count);
   for (int64_t e = 0; e < count; e++) {
     copy_plan(Sizes(batch), to, e, tried.plans(), e);
-    tried.element[e] = batch.element ? batch.element[first + e] : first + e;
+    tried.element[e] = batch.element_of(first + e);
   }
   const auto wanted = [&](int64_t e) {
     return tried.status[e] != int8_t(Status::infeasible) && tried.objective[e] < std::numeric_limits<double>::max();
@@ -614,7 +614,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
     std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
     for (int64_t j = 0; j < all; j++) {
       const int64_t e = tried.owner[j] = live[j % elements];
-      tried.element[j] = batch.element ? batch.element[first + e] : first + e;
+      tried.element[j] = batch.element_of(first + e);
       tried.start[j] = at_target(batch);
       tried.start[j].explore = kExploreFar;
       tried.start[j].needed = needed(out.objective[e]);
@@ -651,7 +651,7 @@ void MpcSearch::retry_failed(const MpcBatch& batch, const MpcEffort& effort, con
   if (count == 0) return;
   tried.resize(batch, count);
   for (int64_t i = 0; i < count; i++) {
-    tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
+    tried.element[i] = batch.element_of(origin[i]);
     tried.start[i] = {false, false, 0.0, softer(batch) * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;

@@ -101,7 +101,7 @@ def factor_inverse(inverse_mass: NDArray[np.float64]) -> NDArray[np.float64]:
         InvalidInputError: rounding leaves no such factor.
     """
     try:
-        return np.linalg.cholesky(inverse_mass).astype(np.float64)
+        return np.linalg.cholesky(inverse_mass).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         raise InvalidInputError(
             "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
