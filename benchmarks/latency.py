@@ -74,7 +74,7 @@ def cart_pole(horizon: int, count: int, seed: int) -> Case:
     weight = torch.diag(torch.tensor([10.0, 50.0, 1.0, 1.0], dtype=torch.float64))
     cost = QuadraticCost(weight, torch.eye(1, dtype=torch.float64), 5 * weight)
     lcs = cart_pole_between_walls()
-    mpc = LCSMPCLayer(LCSModel.from_params(lcs), cost, horizon, -10.0, 10.0, on_failure="mask")
+    mpc = LCSMPCLayer(LCSModel.from_params(lcs), cost, horizon, -10.0, 10.0, on_failure="mask").eval()
     size = torch.tensor([0.05, 0.1, 0.2, 0.2], dtype=torch.float64)
     starts = size * (2 * torch.rand(count, 4, generator=generator, dtype=torch.float64) - 1)
     return Case(mpc, lcs, starts, None, 2e-3)
@@ -83,7 +83,7 @@ def cart_pole(horizon: int, count: int, seed: int) -> Case:
 def cube(horizon: int, count: int, seed: int) -> Case:
     """Push the cube with the model of the zoo, 1 mm of disturbance."""
     lcs = LCSModel.from_pretrained("trifinger-cube")
-    mpc = LCSMPCLayer(lcs, pushing_cost(), horizon, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
+    mpc = LCSMPCLayer(lcs, pushing_cost(), horizon, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask").eval()
     task, settings = get_task("cube"), get_method("pddm")().pddm  # pyright: ignore[reportAttributeAccessIssue]
     sizes = settings.ensemble.networks, settings.ensemble.width
     ensemble = Ensemble(task.n_x, task.n_u, *sizes, torch.Generator().manual_seed(seed))

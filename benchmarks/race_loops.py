@@ -215,7 +215,8 @@ class Cube(Loop):
     def __init__(self) -> None:
         self.env = gymnasium.make("difflcs/TriFingerMoveCube-v0").unwrapped
         self.twin, lcs = self.env.sibling().physics, LCSModel.from_pretrained("zoo:trifinger-cube")
-        self.layer = LCSMPCLayer(lcs, pushing_cost(), HORIZON, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
+        limit = ACTION_LIMIT
+        self.layer = LCSMPCLayer(lcs, pushing_cost(), HORIZON, -limit, limit, relaxation=1e-5, on_failure="mask")
 
     def error(self) -> float:
         """See `Loop`."""

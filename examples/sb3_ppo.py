@@ -109,7 +109,9 @@ def make_system(o: Options) -> tuple[LCSMPCLayer, Any, Any, int, int]:
     attract = {"pairs": [(0, 2), (1, 3)], "pair_weight": 0.1}
     cost = GoalCost.reach(4, 2, goal_weight=(10.0,), input_weight=0.1, **attract)
     reach = BlockAlongWall.reach
-    mpc = LCSMPCLayer(LCSModel.from_params(BlockAlongWall.system), cost, 5, -reach, reach, on_failure="mask")
+    lcs = LCSModel.from_params(BlockAlongWall.system)
+    # Stable-Baselines3 collects in evaluation mode and updates in training mode: one relaxation for both.
+    mpc = LCSMPCLayer(lcs, cost, 5, -reach, reach, relaxation=1e-5, on_failure="mask")
     return mpc, BlockAlongWall, gymnasium.vector.SyncVectorEnv([BlockAlongWall] * 20), BlockAlongWall.steps, 1
 
 

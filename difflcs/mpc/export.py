@@ -59,7 +59,7 @@ def export_controller(
         "n_c": problem.n_c,
         "n_goal": getattr(mpc.cost, "n_goal", 0),
         "horizon": mpc.horizon,
-        "relaxation": mpc.relaxation,
+        "relaxation": problem.relaxation,
         "step_seconds": step_seconds,
         "u_min": _bound(low),
         "u_max": _bound(high),

@@ -33,6 +33,9 @@ from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.records import LCSParams, LCSSequence
 from difflcs.status import Status, solved
 
+HARD, SMOOTH = 1e-7, 1e-5
+"""Relaxation by default: of plans that are executed, nearly hard contact; and in training, for gradients."""
+
 
 class LCSMPCLayer(nn.Module):
     """Model predictive control through an LCS (Eq. 3 of the paper), differentiable in every input.
@@ -53,14 +56,14 @@ class LCSMPCLayer(nn.Module):
             if an nn.Parameter. None: no bound.
         u_max: upper bound, likewise.
         backend: name of a registered backend, or an instance with options.
-        relaxation: product λ·s of the relaxed complementarity of plan and gradient, > 0. 1e-7 is nearly hard contact;
-            with training_relaxation=1e-5 gradients stay smooth in training.
+        relaxation: product λ·s of the relaxed complementarity, of the plan and of its gradient, > 0. None: 1e-7 for
+            plans that are executed, in evaluation mode (`layer.eval()`) and by controllers, where it is nearly hard
+            contact; and 1e-5 in training mode, as new modules are, where gradients are smoother across contacts.
         on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
             bounds, zero gradient, one `SolveWarning` per layer.
         bounds: `StageBounds`, instead of u_min and u_max.
         constraints: `LinearConstraints` or a `ConstraintSequence`, hard or soft.
-        training_relaxation: relaxation in training mode (`layer.train()`), if it differs; `layer.eval()` returns to
-            `relaxation`. A larger one gives smoother gradients across contacts.
+        training_relaxation: relaxation in training mode (`layer.train()`), if it differs from one that is given.
         barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
@@ -89,7 +92,7 @@ class LCSMPCLayer(nn.Module):
         u_min: Bound | None = None,
         u_max: Bound | None = None,
         backend: str | Backend = "batched",
-        relaxation: float = 1e-5,
+        relaxation: float | None = None,
         on_failure: str = "raise",
         *,
         bounds: StageBounds | None = None,
@@ -103,11 +106,9 @@ class LCSMPCLayer(nn.Module):
         self.cost = check_cost(cost)
         self.horizon = check_positive_int("horizon", horizon)
         self.passes = check_positive_int("passes", passes)
-        self.relaxation = check_number("relaxation", relaxation, strict=True)
-        self.training_relaxation = (
-            None
-            if training_relaxation is None
-            else check_number("training_relaxation", training_relaxation, strict=True)
+        self.relaxation, self.training_relaxation = (
+            value if value is None else check_number(name, value, strict=True)
+            for name, value in (("relaxation", relaxation), ("training_relaxation", training_relaxation))
         )
         self.barrier = check_number("barrier", barrier)
         self.on_failure = check_choice("on_failure", on_failure, ("raise", "mask"))
@@ -133,7 +134,7 @@ class LCSMPCLayer(nn.Module):
             self.lcs,
             self.cost,
             self.horizon,
-            self.relaxation,
+            HARD if self.relaxation is None else self.relaxation,
             self.barrier,
             self.backend,
             time.perf_counter(),
@@ -165,7 +166,7 @@ class LCSMPCLayer(nn.Module):
     def extra_repr(self) -> str:
         """Describe the settings for print(layer)."""
         return (
-            f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, "
+            f"horizon={self.horizon}, relaxation={self.relaxation}, backend={self.backend}, "
             f"on_failure={self.on_failure!r}"
         )
 
@@ -210,8 +211,11 @@ class LCSMPCLayer(nn.Module):
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
         setup = self.setup()
-        if self.training and self.training_relaxation is not None:
-            setup = setup._replace(relaxation=self.training_relaxation)
+        softer = self.training_relaxation
+        if softer is None and self.relaxation is None:
+            softer = SMOOTH
+        if self.training and softer is not None:
+            setup = setup._replace(relaxation=softer)
         call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
         plain = isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence)
         if not plain or is_local(self.cost if cost is None else cost):

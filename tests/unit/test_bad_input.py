@@ -251,7 +251,10 @@ def test_a_number_out_of_range_and_what_is_no_number_are_refused(build, case):
         refuse(e.InvalidInputError, rf"{name}: expected .*{words}.*got {re.escape(f'{value:g}')}", call, build, value)
     for value in [True, [0.1], np.True_, 1j, torch.ones(()).requires_grad_(), *(["0.1"] if name != "gamma" else [])]:
         refuse(e.DTypeError, f"{name}: expected a", call, build, value)
-    for value in [*([None] if name != "time_limit" else []), *([2.0] if isinstance(wrong[0], int) else [])]:
+    for value in [
+        *([None] if case not in ("time_limit", "relaxation") else []),
+        *([2.0] if isinstance(wrong[0], int) else []),
+    ]:
         refuse(e.DTypeError, f"{name}: expected a", call, build, value)
 
 

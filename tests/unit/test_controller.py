@@ -95,7 +95,7 @@ def test_what_is_kept_without_contact_fits_every_set_of_active_bounds(build):
 
 
 def test_goals_and_references(reaching):
-    controller, solution = reaching.controller(), None
+    controller, solution = reaching.eval().controller(), None
     rng = np.random.default_rng(1)
     for i, x in enumerate(states(10)):
         guess = None if solution is None else solution.shift()
@@ -167,7 +167,7 @@ class Tilted:
 def test_each_step_may_have_a_system_a_cost_and_bounds_of_its_own(build, asked):
     lcs = Leaning(build.params(0)) if asked == "both" else build.params(0)
     mpc = LCSMPCLayer(lcs, build.cost(0) if asked == "given" else Tilted(build.cost(0)), H, -0.3, 0.3)
-    controller, solution = mpc.controller(time_limit=100.0), None
+    controller, solution = mpc.eval().controller(time_limit=100.0), None
     for i, x in enumerate(states(8)):
         context, own = torch.tensor([1.0 + 0.1 * i]).double() if asked == "both" else None, {}
         goal = None if asked == "given" or i == 3 else 0.1 * torch.from_numpy(x)
@@ -186,7 +186,7 @@ def test_each_step_may_have_a_system_a_cost_and_bounds_of_its_own(build, asked):
 
 
 def test_a_cost_module_is_written_where_it_is_constant(build, tmp_path):
-    mpc = LCSMPCLayer(build.params(0), Tilted(build.cost(0), constant=True), H, -0.3, 0.3)
+    mpc = LCSMPCLayer(build.params(0), Tilted(build.cost(0), constant=True), H, -0.3, 0.3).eval()
     x = states(1)[0]
     path = export_controller(mpc, tmp_path)
     assert np.array_equal(MPCController.load(path).step(x), mpc(torch.from_numpy(x)).action.numpy())
@@ -327,7 +327,7 @@ def test_what_is_unfinished_can_be_acted_by_and_goes_on_in_the_next_step(build):
     x, steps = 0.3 * np.ones(4), {}
     for max_iter in range(1, 13):
         backend = BatchedBackend(effort="fast", max_iter=max_iter, time_limit=60.0)
-        mpc = LCSMPCLayer(build.params(0), build.cost(0), H, -0.5, 0.5, backend=backend)
+        mpc = LCSMPCLayer(build.params(0), build.cost(0), H, -0.5, 0.5, backend, relaxation=1e-5)
         held, acting = mpc.controller(), mpc.controller("unfinished", time_limit=90.0)
         assert (held.time_limit, acting.time_limit) == (60.0, 90.0)
         steps[max_iter] = next((i for i in range(10) if held.step(x) is not None and held.status.solved), 10)
