@@ -211,10 +211,8 @@ class LCSMPCLayer(nn.Module):
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
         setup = self.setup()
-        softer = self.training_relaxation
-        if softer is None and self.relaxation is None:
-            softer = SMOOTH
-        if self.training and softer is not None:
+        if self.training:
+            softer = self.training_relaxation or (SMOOTH if self.relaxation is None else self.relaxation)
             setup = setup._replace(relaxation=softer)
         call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
         plain = isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence)
