@@ -76,9 +76,7 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
     same |= {"goals": o.goals, "evaluation_seed": o.evaluation_seed}
     if all(key({**same, "minutes": m}) in done for m in o.minutes):
         return
-    told = "pose and points in a plane" if method_name == "frame-lcs" else "nothing"
-    if task.physics is not None and method.kind == "physics":
-        told = task.physics.told
+    told = task.physics.told if task.physics is not None and method.kind == "physics" else "nothing"
     per_minute, spent = task.steps_per_minute / task.episode_steps, 0.0
     with ExitStack() as opened:
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from difflcs.physics.complementarity import Bounded, Contacts, FreeMotion, Unilateral, contact_lcs
 from difflcs.physics.frame import BodyFrameLCS
+from difflcs.physics.frame_search import Frame, find_frame
 from difflcs.physics.learnable import ContactLCS
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
@@ -24,6 +25,7 @@ __all__ = [
     "Contacts",
     "Distance",
     "ForceDrive",
+    "Frame",
     "FreeMotion",
     "Inertia",
     "PDDrive",
@@ -35,6 +37,7 @@ __all__ = [
     "Union",
     "box",
     "contact_lcs",
+    "find_frame",
 ]
 
 

@@ -1,73 +1,120 @@
 """An LCS in the frame of a body on a plane: what it learns at one pose of the body holds at all of them."""
 
+from collections.abc import Mapping
+from typing import Any, Self
+
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_tensor, describe
+from difflcs._checks import check_tensor
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
+from difflcs.physics.frame_search import Frame, find_frame
 from difflcs.records import SYSTEM, LCSParams
 
 __all__ = ["BodyFrameLCS"]
 
-_POSE = 3  # x, y, yaw
+_KNOWN = ("units", "yaw", "seen", "turn", "turn_u")  # parameters that are not learned
 
 
 class BodyFrameLCS(LCSModel):
     """A learnable LCS in the frame of a body on a plane, an `LCSModule` whose system follows the body.
 
-    A state is the pose (x, y, yaw) [m, m, rad] of the body, and after it points (x, y) of the same plane, such as
-    fingertips; an action is vectors (x, y) in that plane. With z the points and v the vectors in the axes of the body,
+    A `Frame` says which numbers of a state are the pose of the body and points of the same plane, such as fingertips,
+    and which numbers of an action are vectors in it. With z the state as seen from the body, v the action in its axes,
     and R the rotation from these to the axes of the plane,
 
-        x₊ = x + R (A z + B v + C λ + d),  0 ≤ λ ⊥ D z + E v + F λ + c ≥ 0,
+        x₊ = x + R (A z + B v + C λ + d),  0 ≤ λ ⊥ D z + E v + F λ + c ≥ 0.
 
-    where R leaves the yaw as it is. So a push has the same effect wherever the body is and however it is turned, while
-    a constant LCS has to be right for all poses at once. `params(x)` is this system with R as at x and z linearised
-    there: exact at x, and in the steps of a plan as long as the body turns little. The parameters are these matrices in
-    the units of the data that they are fitted to, see `take_units`.
+    In z, points count from the body and the pose is zero; R leaves plain numbers and the yaw as they are. So a push has
+    the same effect wherever the body is and however it is turned, while a constant LCS has to be right for all poses at
+    once. `params(x)` is this system with R as at x and z linearised there: exact at x, and in the steps of a plan as
+    long as the body turns little. Without a frame, z is x, v is u, R is 1, and this is a constant LCS. The parameters
+    are these matrices in the units of the data that they are fitted to, see `take_units`.
 
     Args:
-        n_x: number of states, 3 + 2 for each point, at least one.
-        n_u: number of actions, 2 for each vector.
+        n_x: number of states.
+        n_u: number of actions.
         n_lam: number of complementarity variables.
         stiffness: see `LCSModel`.
+        frame: the columns of the body; None: they are not known, see `take_frame`.
         **options: see `LCSModel`. The distance at which a point touches the body is in c, which should be learned.
 
     Raises:
-        InvalidInputError: sizes that are no pose and points, or no vectors; and as for `LCSModel`.
+        InvalidInputError: a frame with other columns than these; and as for `LCSModel`.
     """
 
     kind = "BodyFrameLCS"
     batched = True
     """Whether the parameters may have batch dimensions, those of the states."""
 
-    def __init__(self, n_x: int, n_u: int, n_lam: int, stiffness: float = 0.1, **options):
-        if not (isinstance(n_x, int) and n_x > _POSE and n_x % 2 and isinstance(n_u, int) and n_u % 2 == 0):
-            raise InvalidInputError(
-                f"n_x, n_u: expected 3 + 2 for each point and 2 for each vector of the plane, got {describe(n_x)} and "
-                f"{describe(n_u)}; the state is (x, y, yaw) of the body, then (x, y) of each point"
-            )
+    def __init__(
+        self, n_x: int, n_u: int, n_lam: int, stiffness: float = 0.1, *, frame: Frame | None = None, **options
+    ):
         super().__init__(n_x, n_u, n_lam, stiffness, **options)
-        unit, pairs = torch.eye(n_x, dtype=self.A.dtype), (n_x - _POSE) // 2
-        places = torch.cat([unit[:2], unit[_POSE:]])
-        self.register_buffer("_places", places, persistent=False)
-        self.register_buffer("_yaw", unit[2:_POSE], persistent=False)
-        self.register_buffer("_relative", unit[_POSE:] - places[:2].repeat(pairs, 1), persistent=False)
-        self.units.requires_grad_(False).fill_(1.0)[: 2 * pairs] = 0.0
+        for name in _KNOWN:
+            getattr(self, name).requires_grad_(False).zero_()
+        self.units[n_x:], self.seen[range(n_x), range(n_x)] = 1.0, 1.0
+        self._initial = {name: value.clone() for name, value in self.state_dict().items() if name != "action_support"}
+        self._start(frame)
 
     units: nn.Parameter
     """Units of the parameters, see `take_units`: mean and scale of z, scales of v and of the change of the state."""
-    _places: Tensor  # rows of the unit matrix: all places in a state, its yaw; and points from the body's place
-    _yaw: Tensor
-    _relative: Tensor
+    yaw: nn.Parameter  # (n_x,) picks the yaw from a state; what is known of the frame is saved, and not learned
+    seen: nn.Parameter  # (n_x, n_x) makes points of a state count from the body, and its pose zero
+    turn: nn.Parameter  # (n_x, n_x) turns all pairs of a state by a right angle, and makes plain numbers zero
+    turn_u: nn.Parameter  # (n_u, n_u) the same of an action
 
     @staticmethod
     def _shapes(x: int, u: int, m: int) -> dict[str, tuple[int, ...]]:
-        points = x - _POSE
-        return {**LCSModel._shapes(x, u, m), "A": (x, points), "D": (m, points), "units": (2 * points + u + x,)}
+        frame = {"units": (3 * x + u,), "yaw": (x,), "seen": (x, x), "turn": (x, x), "turn_u": (u, u)}
+        return {**LCSModel._shapes(x, u, m), **frame}
+
+    @torch.no_grad()
+    def _start(self, frame: Frame | None) -> None:
+        """Begin with the first parameters in a frame."""
+        for name, value in self._initial.items():
+            getattr(self, name).copy_(value)
+        if frame is None:
+            return
+        pairs = (frame.place, *frame.points)
+        states, inputs = [frame.yaw, *sum(pairs, ())], [*sum(frame.vectors, ())]
+        for used, size in ((states, self.n_x), (inputs, self.n_u)):
+            if len({*used} & {*range(size)}) < len(used):
+                raise InvalidInputError(f"frame: expected columns below {size}, each of them once, got {frame}")
+        self.yaw[frame.yaw] = 1.0
+        self.seen[states[:3]] = 0.0
+        for matrix, turned in ((self.turn, pairs), (self.turn_u, frame.vectors)):
+            for i, j in turned:
+                matrix[j, i], matrix[i, j] = 1.0, -1.0
+        for pair in frame.points:
+            self.seen[pair, frame.place] = -1.0
+
+    @property
+    def frame(self) -> Frame | None:
+        """The columns of the body; None: this is a constant LCS."""
+        if not bool(self.yaw.any()):
+            return None
+        pairs, vectors = (sorted((i, j) for j, i in (m > 0).nonzero().tolist()) for m in (self.turn, self.turn_u))
+        place = next(pair for pair in pairs if not bool(self.seen[pair[0]].any()))
+        pairs.remove(place)
+        return Frame(int(self.yaw.argmax()), place, tuple(pairs), tuple(vectors))
+
+    def take_frame(self, x: Tensor, u: Tensor, x_next: Tensor) -> bool:
+        """Look for the frame in transitions, see `find_frame`. If it is another one, start anew in it and return True.
+
+        Args:
+            x: (N, n_x) states.
+            u: (N, n_u) actions.
+            x_next: (N, n_x) next states.
+        """
+        frame = find_frame(x, u, x_next)
+        if frame is None or frame == self.frame:
+            return False
+        self._start(frame)
+        return True
 
     @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
@@ -81,15 +128,13 @@ class BodyFrameLCS(LCSModel):
         check_tensor("x", x, [("n_x", self.n_x)])
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)
-        turn = _turn(x)
-        into = _blocks(turn, (self.n_x - _POSE) // 2)
-        z = _apply(into, _apply(self._relative, x))
-        by_yaw = torch.stack([z[..., 1::2], -z[..., ::2]], -1).flatten(-2)
-        by_x = into @ self._relative + by_yaw.unsqueeze(-1) * self._yaw
-        R = self._to_plane(turn)
+        yaw = x @ self.yaw
+        R = _rotation(self.turn, yaw)
+        z = _apply(R.mT @ self.seen, x)
+        by_x = R.mT @ self.seen - _apply(self.turn, z).unsqueeze(-1) * self.yaw
         own = self._in_si()
         A = R @ own["A"] @ by_x + torch.eye(self.n_x, dtype=x.dtype, device=x.device)
-        D, inputs = own["D"] @ by_x, _blocks(turn, self.n_u // 2)
+        D, inputs = own["D"] @ by_x, _rotation(self.turn_u, yaw).mT
         return LCSParams(
             A=A,
             B=R @ own["B"] @ inputs,
@@ -116,12 +161,13 @@ class BodyFrameLCS(LCSModel):
             The transitions in these units, standardised, as seen from the body, itself at the origin.
         """
         with torch.no_grad():
-            turn, old = _turn(x), self._in_si()
-            z = _apply(_blocks(turn, (self.n_x - _POSE) // 2) @ self._relative, x)
-            v, change = _apply(_blocks(turn, self.n_u // 2), u), _apply(self._to_plane(turn).mT, x_next - x)
+            old, yaw = self._in_si(), x @ self.yaw
+            back = _rotation(self.turn, yaw).mT
+            z, change = _apply(back @ self.seen, x), _apply(back, x_next - x)
+            v = _apply(_rotation(self.turn_u, yaw).mT, u)
             # What moves less than a micrometre rests, and is no unit.
             units = [z.mean(0), *(one.std(0, correction=0).clamp_min(1e-6) for one in (z, v, change))]
-            drawn = bool((self.units[self.n_x - _POSE :] == 1).all())
+            drawn = bool((self.units[self.n_x :] == 1).all())
             self.units.copy_(torch.cat(units))
             middle, by_z, by_v, by_change = units
             if not drawn:
@@ -129,44 +175,55 @@ class BodyFrameLCS(LCSModel):
                 self.c.copy_(old["c"] + _apply(old["D"], middle))
                 for name, unit in self._scales().items():
                     getattr(self, name).copy_((self.d if name == "d" else old[name]) / unit)
-            seen = torch.cat([torch.zeros_like(x[:, :_POSE]), (z - middle) / by_z], -1)
+            seen = (z - middle) / by_z
             return seen, v / by_v, seen + change / by_change
 
     def _scales(self) -> dict[str, Tensor]:
         """Return the units of the matrices."""
-        points = self.n_x - _POSE
-        _, z, v, change = self.units.split([points, points, self.n_u, self.n_x])
+        _, z, v, change = self.units.split([self.n_x, self.n_x, self.n_u, self.n_x])
         rows = change[:, None]
         return {"A": rows / z, "B": rows / v, "C": rows, "d": change, "D": 1 / z, "E": 1 / v}
 
     def _in_si(self) -> dict[str, Tensor]:
         """Return the matrices in metres and radians."""
         own = {name: getattr(self, name) * unit for name, unit in self._scales().items()}
-        own["d"] = own["d"] - _apply(own["A"], self.units[: self.n_x - _POSE])
-        return {**own, "F": self.F, "c": self.c - _apply(own["D"], self.units[: self.n_x - _POSE])}
+        own["d"] = own["d"] - _apply(own["A"], self.units[: self.n_x])
+        return {**own, "F": self.F, "c": self.c - _apply(own["D"], self.units[: self.n_x])}
 
     def at_rest(self) -> LCSParams:
-        """Return the system in the units of `take_units`, of states whose pose is zero."""
-        A = self.A @ self._relative + torch.eye(self.n_x, dtype=self.A.dtype, device=self.A.device)
+        """Return the system of the transitions of `take_units`."""
         system = {name: getattr(self, name) for name in SYSTEM}
-        return LCSParams(**{**system, "A": A, "D": self.D @ self._relative})
+        return LCSParams(**{**system, "A": self.A + torch.eye(self.n_x, dtype=self.A.dtype, device=self.A.device)})
 
-    def _to_plane(self, turn: Tensor) -> Tensor:
-        """Return R of the axes of the plane in those of the body."""
-        return self._places.mT @ _blocks(turn.mT, len(self._places) // 2) @ self._places + self._yaw.mT @ self._yaw
+    @classmethod
+    def from_params(cls, params: LCSParams, stiffness: float | None = None) -> Self:
+        """See `LCSModel`. There is no frame."""
+        model: Any = super().from_params(params, stiffness)
+        with torch.no_grad():
+            model.A -= torch.eye(model.n_x, dtype=model.A.dtype, device=model.A.device)
+        return model
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Self:
+        """See `LCSModel`. Earlier files have no frame: their states are x, y, yaw of the body and points."""
+        if "turn" in tensors or not {"A", "B", "D", "units"} <= {*tensors}:
+            return super().from_config(config, tensors, source)
+        (n_x, points), n_u, pad = tensors["A"].shape, tensors["B"].shape[-1], nn.functional.pad
+        pairs = [tuple((k, k + 1) for k in range(first, size - 1, 2)) for first, size in ((3, n_x), (0, n_u))]
+        first = cls(n_x, n_u, 1, frame=Frame(2, (0, 1), *pairs), dtype=tensors["A"].dtype).state_dict()
+        mean, scale, others = tensors["units"].split([points, points, n_u + n_x])
+        units = torch.cat([pad(mean, (3, 0)), pad(scale, (3, 0), value=1.0), others])
+        columns = {name: pad(tensors[name], (3, 0)) for name in ("A", "D")}
+        return super().from_config(
+            config, {**tensors, **{name: first[name] for name in _KNOWN}, **columns, "units": units}, source
+        )
 
 
-def _turn(x: Tensor) -> Tensor:
-    """Return the (..., 2, 2) matrices from the axes of the plane to those of the body."""
-    cos, sin = x[..., 2].cos(), x[..., 2].sin()
-    return torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -2)
+def _rotation(turn: Tensor, angle: Tensor) -> Tensor:
+    """Return the (..., n, n) rotations by angles (...) of the pairs that `turn` turns by a right angle."""
+    sin, cos = angle.sin()[..., None, None], angle.cos()[..., None, None]
+    return torch.eye(len(turn), dtype=turn.dtype, device=turn.device) + sin * turn + (1 - cos) * (turn @ turn)
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def _blocks(matrix: Tensor, count: int) -> Tensor:
-    """Repeat matrices (..., 2, 2) on a diagonal of `count` blocks."""
-    unit = torch.eye(count, dtype=matrix.dtype, device=matrix.device)
-    return (unit[:, None, :, None] * matrix[..., None, :, None, :]).flatten(-2).flatten(-3, -2)

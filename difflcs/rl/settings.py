@@ -1,10 +1,5 @@
 """Settings: frozen dataclasses whose fields declare their bounds, and the groups of them that methods share.
 
-    @dataclass(frozen=True)
-    class Planner(Settings):
-        samples: int = bounded(700, minimum=1, maximum=10**6)
-        noise: float = bounded(0.9, above=0)
-
 One validator reads types and bounds; one reader rebuilds a configuration from JSON. A group that only one module uses
 is defined there.
 """

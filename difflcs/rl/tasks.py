@@ -1,13 +1,7 @@
 """Tasks: descriptions of environments for training, evaluation and pictures. Other packages register theirs here.
 
-    register_task(TaskSpec(name="block", env=PushBlock, make_cost=..., ...))
-    train(TrainConfig(task="block"))
-
-A package publishes its tasks without being imported first by an entry point in its pyproject.toml, a function without
-arguments that registers them:
-
-    [project.entry-points."difflcs.tasks"]
-    blocks = "my_package.tasks:register_tasks"
+A package publishes its tasks without being imported first by an entry point of the group "difflcs.tasks", a function
+without arguments that registers them: docs/own_system.md makes one.
 """
 
 from __future__ import annotations
@@ -156,8 +150,6 @@ class TaskSpec:
         threaded: the vector environment takes the argument `threads`.
         model_name: what its models are called in the zoo; None: as the task.
         physics: what is known of its physics, for methods that start from it; None: nothing.
-        planar: the state is the pose (x, y [m], yaw [rad]) of a body on a plane, and after it points (x, y) of the
-            plane; actions are vectors in it; and motion is the same wherever the body is, as for `BodyFrameLCS`.
 
     Raises:
         InvalidInputError: a value does not fit.
@@ -189,7 +181,6 @@ class TaskSpec:
     threaded: bool = False
     model_name: str | None = None
     physics: PhysicsSpec | None = None
-    planar: bool = False
 
     def __post_init__(self) -> None:
         make_plain(self)

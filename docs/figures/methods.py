@@ -2,8 +2,8 @@
 
 `python docs/figures/methods.py`
 
-Above success over minutes of data on the cube, of methods that are told nothing, and apart of those that are told
-something of the object or of its state; below at the end on all seven objects.
+Above success over minutes of data on the cube, of methods that are told nothing, and apart of the one that is told the
+outline; below at the end on all seven objects.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ Points = dict[float, list[float]]
 OBJECTS = ("cube", "sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
 NOTHING = {
     "lcs-rl": ("LCS-RL", "#d55e00"),
+    "frame-lcs": ("LCS in the body's frame", "#56b4e9"),
     "pddm": ("PDDM (networks)", "#009e73"),
     "ppo": ("PPO without warm-up", "#e69f00"),
     "violation": ("violation loss only", "#0072b2"),
 }
 """Methods that are told nothing → names, colours."""
-SOMETHING = {
-    "contact-lcs": ("ContactLCS, told the outline", "#cc79a7"),
-    "frame-lcs": ("LCS in the body's frame, told the plane", "#56b4e9"),
+OUTLINE = {
+    "contact-lcs": ("ContactLCS", "#cc79a7"),
 }
-"""Those that are told something → names with what it is, colours."""
+"""Those that are told the outline → names, colours."""
 
 
 def recorded(task: str, method: str) -> Points:
@@ -92,7 +92,7 @@ def draw_minutes(axes: Axes, methods: dict[str, tuple[str, str]], title: str, lo
 def draw_objects(axes: Axes) -> None:
     """The last evaluation on every object; that of ContactLCS after three minutes."""
     for k, method in enumerate(("contact-lcs", "lcs-rl", "violation")):
-        _, color = {**NOTHING, **SOMETHING}[method]
+        _, color = {**NOTHING, **OUTLINE}[method]
         for y, task in enumerate(OBJECTS):
             points = points_of(task, method)
             minute = 3.0 if method == "contact-lcs" else max(points, default=0.0)
@@ -116,7 +116,7 @@ def main() -> None:
         3, 1, figsize=(7.0, 9.0), layout="constrained", height_ratios=[3, 1.2, 3]
     )
     draw_minutes(above, NOTHING, "told nothing", 0)
-    draw_minutes(middle, SOMETHING, "told something", 79)
+    draw_minutes(middle, OUTLINE, "told the outline", 79)
     middle.set_xlabel("minutes of data on the cube")
     draw_objects(below)
     for axes in (above, middle, below):

@@ -212,7 +212,6 @@ def trifinger_task(
         threaded=True,
         model_name=f"trifinger-{name.replace('_', '-')}",
         physics=None if task is not MOVE else contact_physics(env_kwargs),
-        planar=task is MOVE,
     )
 
 

@@ -5,10 +5,10 @@ The methods of the library on a task of one's own, by the common code; a method 
 
 import json
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -18,12 +18,12 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.state_tree import copy_state, flatten, unflatten
 from difflcs.rl.learning.trainer import Trainer
-from difflcs.rl.methods import FrameMethod, Method, MujocoMethod, Work, get_method, method_names, register_method
+from difflcs.rl.methods import Method, MujocoMethod, Work, get_method, method_names, register_method
 from difflcs.rl.runs import training
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, stored_config, sum_seconds, train
-from difflcs.rl.tasks import TaskSpec, register_task
+from difflcs.rl.tasks import register_task
 from tests.conformance.toy import STEPS, make_task
 
 pytestmark = pytest.mark.usefixtures("registered")
@@ -31,15 +31,6 @@ pytestmark = pytest.mark.usefixtures("registered")
 # The toy is no MuJoCo model; this method is contact-lcs besides, see tests/unit/test_contact_method.py.
 NAMES = tuple(name for name in method_names() if name != MujocoMethod.name)
 TOY = make_task()
-
-
-def task_of(name: str, larger: bool = False) -> TaskSpec:
-    """The toy as a method takes it: with a body and a point on a plane where it learns in the frame of the body."""
-    return (
-        make_task(size=5 + 2 * larger, inputs=2, planar=True)
-        if name == FrameMethod.name
-        else make_task(size=2 + larger)
-    )
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -77,36 +68,23 @@ def finished(tmp_path_factory) -> Any:
     def get(name: str) -> RunDirectory:
         if name not in runs:
             path = str(tmp_path_factory.mktemp(name) / "run")  # directories may be strings
-            runs[name] = train(make_config(name), path, task=task_of(name))
+            runs[name] = train(make_config(name), path)
         return runs[name]
 
     return get
 
 
-class Trainers:
-    """Trainers of smoke settings; their environments are closed at the end."""
-
-    def __init__(self) -> None:
-        self.opened: list[gymnasium.vector.VectorEnv] = []
-
-    def __call__(self, name: str, larger: bool = False) -> Trainer:
-        task = task_of(name, larger)
-
-        def make_envs(count: int) -> gymnasium.vector.VectorEnv:
-            self.opened.append(task.make_envs(count))
-            return self.opened[-1]
-
-        config = make_config(name)
-        episodes = round(config.minutes * task.steps_per_minute / STEPS)
-        return config.method.trainer(Work(task, 0, episodes, make_envs))
-
-
 @pytest.fixture
 def make_trainer():
-    made = Trainers()
-    yield made
-    for envs in made.opened:
-        envs.close()
+    with ExitStack() as opened:
+
+        def make(name: str, larger: bool = False) -> Trainer:
+            task, config = make_task(size=2 + larger), make_config(name)
+            episodes = round(config.minutes * task.steps_per_minute / STEPS)
+            work = Work(task, 0, episodes, lambda count: opened.enter_context(closing(task.make_envs(count))))
+            return config.method.trainer(work)
+
+        yield make
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
@@ -171,7 +149,7 @@ def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished
     for attempt in range(20):
         torch.manual_seed(attempt)
         try:
-            train(make_config(name), path, task=task_of(name), resume=attempt > 0, reporter=Dies())
+            train(make_config(name), path, resume=attempt > 0, reporter=Dies())
             break
         except KeyboardInterrupt:
             interrupted += 1
@@ -202,9 +180,9 @@ def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(name, finished, tm
         patch.setattr(training, "save_checkpoint", dies)
         for attempt in range(2):
             with pytest.raises(KeyboardInterrupt):
-                train(make_config(name), path, task=task_of(name), resume=attempt > 0)
+                train(make_config(name), path, resume=attempt > 0)
     assert saved == ["kept", "lost", "lost"]
-    rows = train(make_config(name), path, task=task_of(name), resume=True).rows()
+    rows = train(make_config(name), path, resume=True).rows()
     assert [row["iteration"] for row in rows] == [row["iteration"] for row in whole.rows()]
 
 
@@ -223,7 +201,7 @@ def test_a_state_decides_everything_that_follows(name, make_trainer):
 
 
 def test_another_seed_is_another_training(name, finished, tmp_path):
-    other = train(make_config(name, seed=1), tmp_path / "other", task=task_of(name))
+    other = train(make_config(name, seed=1), tmp_path / "other")
     assert (other.model / "model.safetensors").read_bytes() != (finished(name).model / "model.safetensors").read_bytes()
 
 
@@ -273,21 +251,21 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     save_checkpoint(run.checkpoints, state["iteration"], state)
     files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
     with pytest.raises(CheckpointError, match="another method"):
-        train(make_config(name), run.path, task=task_of(name), resume=True)
+        train(make_config(name), run.path, resume=True)
     if make_config(other).method.kind != make_config(name).method.kind:
         with pytest.raises(CheckpointError):
-            load_policy(run, task_of(name))
+            load_policy(run, TOY)
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == files
 
 
 def test_a_run_is_not_continued_with_another_configuration_or_environment(name, finished, tmp_path):
     for change in ({"seed": 1}, {"minutes": 3.5}, {"evaluate_goals": 2}):
         with pytest.raises(CheckpointError, match="drop the changes"):
-            train(make_config(name, **change), finished(name).path, task=task_of(name), resume=True)
-    described = replace(task_of(name), describe=lambda env: {"mass": 1.0})
+            train(make_config(name, **change), finished(name).path, resume=True)
+    described = replace(TOY, describe=lambda env: {"mass": 1.0})
     with pytest.raises(KeyboardInterrupt):
         train(make_config(name), tmp_path / "run", task=described, reporter=Dies())
-    other = replace(task_of(name), describe=lambda env: {"mass": 2.0})
+    other = replace(TOY, describe=lambda env: {"mass": 2.0})
     with pytest.raises(CheckpointError, match="the environment it was started with"):
         train(make_config(name), tmp_path / "run", task=other, resume=True)
 
@@ -300,11 +278,11 @@ def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
     for which, error in (("right", None), ("wrong", "init: expected a model with n_x=2")):
         out = tmp_path / f"from-{which}"
         if takes and error is None:
-            run = train(make_config(name), out, task=task_of(name), init=str(tmp_path / which))
+            run = train(make_config(name), out, init=str(tmp_path / which))
             assert load_model(run.path).n_lam == 1
             continue
         with pytest.raises(InvalidInputError, match=error if takes else f"none with method {name}"):
-            train(make_config(name), out, task=task_of(name), init=tmp_path / which)
+            train(make_config(name), out, init=tmp_path / which)
         assert not out.exists()
 
 
@@ -322,16 +300,16 @@ def test_only_what_learned_a_model_gives_one(name, finished):
 
 def test_what_was_learned_of_other_sizes_is_refused(name, finished):
     with pytest.raises(CheckpointError, match="expected"):
-        load_policy(finished(name), task_of(name, larger=True))
+        load_policy(finished(name), make_task(size=3))
 
 
 # --- evaluation -------------------------------------------------------------------------------------------------------
 
 
 def test_an_evaluation_repeats_bit_for_bit(name, finished):
-    envs = task_of(name).make_envs(3)
-    results = [evaluate(envs, load_policy(finished(name), task_of(name)), 7, 5, STEPS) for _ in range(2)]
-    policy = load_policy(finished(name), task_of(name))
+    envs = TOY.make_envs(3)
+    results = [evaluate(envs, load_policy(finished(name), TOY), 7, 5, STEPS) for _ in range(2)]
+    policy = load_policy(finished(name), TOY)
     results += [evaluate(envs, policy, 7, 5, STEPS) for _ in range(2)]
     assert all(result == results[0] for result in results)
     assert results[0].goals == 7
@@ -342,12 +320,12 @@ def test_an_unfinished_run_gives_the_policy_of_its_trainer(name, make_trainer, t
     trainer = make_trainer(name)
     config = make_config(name)
     run = RunDirectory.create(tmp_path / "run", {"kind": "run", "config": config.to_json(), "init": None})
-    envs = task_of(name).make_envs(4)
+    envs = TOY.make_envs(4)
     for _ in range(2):
         trainer.step()
         save_checkpoint(run.checkpoints, trainer.iteration, trainer.state_dict())
         assert not run.finished()
-        found = evaluate(envs, load_policy(run, task_of(name)), 8, 0, STEPS)
+        found = evaluate(envs, load_policy(run, TOY), 8, 0, STEPS)
         assert found == evaluate(envs, trainer.policy, 8, 0, STEPS)
     envs.close()
 

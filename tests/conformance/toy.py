@@ -24,14 +24,14 @@ def outcome(state: Any, action: Any, after: Any, goal: Any, ended: Any) -> tuple
 
 
 class Slide(gymnasium.Env):
-    """The first states move as told, one for each input, the others fade."""
+    """The first state moves as told, the others fade."""
 
-    def __init__(self, size: int = 2, inputs: int = 1):
+    def __init__(self, size: int = 2):
         box = spaces.Box
         self.observation_space = spaces.Dict(
             state=box(-9.0, 9.0, (size,), np.float64), goal=box(-1.0, 1.0, (1,), np.float64)
         )
-        self.action_space = box(-U_MAX, U_MAX, (inputs,), np.float64)
+        self.action_space = box(-U_MAX, U_MAX, (1,), np.float64)
         self.size = size
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -51,7 +51,7 @@ class Slide(gymnasium.Env):
 
     def move(self, action: np.ndarray) -> np.ndarray:
         """Return the next state."""
-        return np.append(self.state[: len(action)] + action, 0.5 * self.state[len(action) :])
+        return np.append(self.state[:1] + action, 0.5 * self.state[1:])
 
     def _error(self) -> float:
         return float(abs(self.state[0] - self.goal[0]))
@@ -88,13 +88,13 @@ class Guess(nn.Module):
         )
 
 
-def make_task(name: str = "toy", size: int = 2, inputs: int = 1, **changes: Any) -> TaskSpec:
+def make_task(name: str = "toy", size: int = 2, **changes: Any) -> TaskSpec:
     values: dict[str, Any] = {
         "name": name,
         "summary": "Move a point to a place.",
         "env": Slide,
-        "env_kwargs": {"size": size, "inputs": inputs},
-        "make_cost": partial(GoalCost.reach, size, inputs, goal_weight=(5.0,), input_weight=0.1),
+        "env_kwargs": {"size": size},
+        "make_cost": partial(GoalCost.reach, size, 1, goal_weight=(5.0,), input_weight=0.1),
         "u_min": -U_MAX,
         "u_max": U_MAX,
         "horizon": 3,

@@ -43,9 +43,9 @@ TASK = TaskSpec(
 
 
 @pytest.mark.parametrize(
-    # lcs-rl is violation and ppo, one after the other; the physics of this task is no MuJoCo model, it is no plane.
+    # lcs-rl is violation and ppo, one after the other; the physics of this task is no MuJoCo model.
     "method",
-    sorted({*method_names()} - {"violation", "ppo", "mujoco-lcs", "frame-lcs"}),
+    sorted({*method_names()} - {"violation", "ppo", "mujoco-lcs"}),
 )
 def test_every_method_trains_a_task_with_a_context(method, tmp_path):
     config = replace(TrainConfig(task="gains", method=get_method(method)()).smoke(), minutes=0.6)

@@ -13,26 +13,35 @@ from tensordict import TensorDict
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.physics import BodyFrameLCS
-from difflcs.rl import FrameMethod, LCSMPCPolicy, TrainConfig, load_policy, train
+from difflcs.physics import BodyFrameLCS, Frame
+from difflcs.rl import Epochs, FrameMethod, LCSMPCPolicy, Work, get_task
 from difflcs.rl.learning.jacobian import system_jacobian
+
+FRAME = Frame(3, (1, 2), ((0, 6), (4, 5)), ((3, 1), (0, 2)))
+"""Columns out of order, the last is a plain number."""
 
 
 @pytest.fixture
 def lcs(build):
-    model = BodyFrameLCS(7, 4, 3, init_scale=0.3, generator=torch.Generator().manual_seed(0))
+    model = BodyFrameLCS(8, 5, 3, frame=FRAME, init_scale=0.3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         model.c.copy_(build.normal(2)(3))
     return model
 
 
 def test_it_is_what_its_docstring_says(lcs, build):
-    x, u = build.normal(0)(7), build.normal(1)(4)
-    turn = torch.linalg.matrix_exp(x[2] * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64))
-    z, v = ((p.view(2, 2) @ turn).flatten() for p in (x[3:] - x[:2].repeat(2), u))
+    x, u = build.normal(0)(8), build.normal(1)(5)
+    into = torch.linalg.matrix_exp(x[3] * torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64))
+    z, v = x.clone(), u.clone()
+    z[[1, 2, 3]] = 0
+    for i, j in FRAME.points:
+        z[[i, j]] = into @ (x[[i, j]] - x[[1, 2]])
+    for i, j in FRAME.vectors:
+        v[[i, j]] = into @ u[[i, j]]
     found = lcs(x, u)
-    change = lcs.A @ z + lcs.B @ v + lcs.C @ found.lam + lcs.d
-    moved = torch.cat([turn @ change[:2], change[2:3], turn @ change[3:5], turn @ change[5:]])
+    moved = lcs.A @ z + lcs.B @ v + lcs.C @ found.lam + lcs.d
+    for i, j in (FRAME.place, *FRAME.points):
+        moved[[i, j]] = into.mT @ moved[[i, j]]
     torch.testing.assert_close(found.x_next, x + moved)
     torch.testing.assert_close(lcs.params(x).gap(x, u), lcs.D @ z + lcs.E @ v + lcs.c)
     by_x = torch.autograd.functional.jacobian(lambda at: lcs.params(at).gap(at, 0 * u), x)
@@ -40,16 +49,16 @@ def test_it_is_what_its_docstring_says(lcs, build):
 
 
 def test_its_jacobian_is_that_of_any_module(lcs, build):
-    mpc = LCSMPCLayer(lcs, GoalCost.reach(7, 4, (1.0, 1.0), input_weight=0.1), horizon=2, u_min=-1.0, u_max=1.0)
+    mpc = LCSMPCLayer(lcs, GoalCost.reach(8, 5, (1.0, 1.0), input_weight=0.1), horizon=2, u_min=-1.0, u_max=1.0)
     policy = LCSMPCPolicy(mpc, std=1.0)
-    state, goal = build.normal(0)(5, 7), build.normal(1)(5, 2)
+    state, goal = build.normal(0)(5, 8), build.normal(1)(5, 2)
     found = policy.jacobian(TensorDict({"state": state, "goal": goal}, [5]))
     torch.testing.assert_close(found, system_jacobian(mpc, state, goal, None, None))
 
 
 def test_units_change_the_parameters_and_not_the_system(lcs, build):
-    x, u = build.normal(0)(20, 7), build.normal(1)(20, 4)
-    after = x + 0.01 * build.normal(2)(20, 7)
+    x, u = build.normal(0)(20, 8), build.normal(1)(20, 5)
+    after = x + 0.01 * build.normal(2)(20, 8)
     lcs.take_units(x, u, x + after)
     system, D = lcs.params(x), lcs.D.clone()
     seen, v, seen_after = lcs.take_units(2 * x, u, after)
@@ -59,27 +68,51 @@ def test_units_change_the_parameters_and_not_the_system(lcs, build):
     torch.testing.assert_close(lcs.at_rest().gap(seen, v), lcs.params(2 * x).gap(2 * x, u))
 
 
-def test_files_and_sizes(lcs, tmp_path, build):
-    x = build.normal(0)(9, 7)
-    lcs.take_units(x, build.normal(1)(9, 4), 2 * x)
+def test_files_and_frames(lcs, tmp_path, build):
+    x = build.normal(0)(9, 8)
+    lcs.take_units(x, build.normal(1)(9, 5), 2 * x)
     lcs.save_pretrained(tmp_path)
-    torch.testing.assert_close(BodyFrameLCS.from_pretrained(tmp_path).params(x).A, lcs.params(x).A, rtol=0, atol=0)
+    again = BodyFrameLCS.from_pretrained(tmp_path)
+    assert again.frame == FRAME._replace(vectors=((0, 2), (3, 1)))
+    torch.testing.assert_close(again.params(x).A, lcs.params(x).A, rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="BodyFrameLCS"):
         LCSModel.from_pretrained(tmp_path)
-    for sizes in ((3, 2), (6, 2), (7, 3)):
-        with pytest.raises(InvalidInputError, match="for each point"):
-            BodyFrameLCS(*sizes, 2)
+    for wrong in (FRAME._replace(yaw=8), FRAME._replace(yaw=1), FRAME._replace(vectors=((0, 5),))):
+        with pytest.raises(InvalidInputError, match="frame: expected columns below"):
+            BodyFrameLCS(8, 5, 3, frame=wrong)
     with pytest.raises(InvalidInputError, match="x: expected the states of the system"):
         lcs.params()
 
 
+def test_without_a_frame_it_is_a_constant_lcs(build):
+    lcs, x = BodyFrameLCS(4, 2, 3, init_scale=0.3), build.normal(0)(2, 4)
+    assert lcs.frame is None
+    one, other = (lcs.params(at) for at in x)
+    for system in (other, BodyFrameLCS.from_params(one).params(x[0])):
+        for name, value in one.tensors().items():
+            torch.testing.assert_close(value, getattr(system, name))
+
+
+def test_files_without_a_frame_are_of_a_pose_and_points(build):
+    frame = Frame(2, (0, 1), ((3, 4), (5, 6)), ((0, 1), (2, 3)))
+    lcs, x, u = BodyFrameLCS(7, 4, 3, frame=frame, init_scale=0.3), build.normal(0)(9, 7), build.normal(1)(9, 4)
+    lcs.take_units(x, u, 2 * x)
+    tensors = {name: value for name, value in lcs.state_dict().items() if name not in ("yaw", "seen", "turn", "turn_u")}
+    tensors |= {name: tensors[name][:, 3:] for name in ("A", "D")}
+    tensors["units"] = torch.cat([tensors["units"][3:7], tensors["units"][10:]])
+    again = BodyFrameLCS.from_config(lcs.config(), tensors, "old")
+    torch.testing.assert_close(again.params(x).step(x, u).x_next, lcs.params(x).step(x, u).x_next, rtol=0, atol=0)
+
+
 @pytest.mark.slow
-def test_the_warmup_alone_will_do(tmp_path):
+def test_the_warmup_finds_the_frame_and_goes_on_with_it():
     """With PPO after it: tests/conformance/test_methods.py."""
-    config = TrainConfig(task="cube", method=FrameMethod().smoke(), minutes=0.2, final_goals=3)
-    run = train(config, tmp_path / "run")
-    assert not any(row["kl"] for row in run.rows())
-    policy: Any = load_policy(run)
-    assert isinstance(policy.lcs, BodyFrameLCS)
-    with pytest.raises(InvalidInputError, match="a planar task for frame-lcs, got turn_cube"):
-        train(replace(config, task="turn_cube"), tmp_path / "other")
+    task = get_task("cube")
+    method = replace(FrameMethod(), warmup=replace(FrameMethod().warmup, epochs=Epochs(100, 5, 100)))
+    trainers: Any = [method.trainer(Work(task, 0, 70, task.make_envs)) for _ in range(2)]
+    while trainers[0].learned.frame is None:
+        trainers[0].step()
+    trainers[1].load(trainers[0].state_dict())
+    first, second = ([trainer.step(), trainer.learned] for trainer in trainers)
+    assert first[1].frame == Frame(2, (0, 1), ((3, 4), (5, 6), (7, 8)), ((0, 1), (2, 3), (4, 5))) == second[1].frame
+    assert torch.equal(first[1].A, second[1].A)

@@ -1,12 +1,8 @@
 """Downloading the YCB meshes, from a server on this machine."""
 
-import contextlib
-import gzip
 import http.server
 import io
 import json
-import random
-import signal
 import subprocess
 import sys
 import tarfile
@@ -28,14 +24,12 @@ def box_stl(size=(0.176, 0.092, 0.045)) -> bytes:
     return trimesh.creation.box(size).export(file_type="stl")
 
 
-def archive(files, kind=tarfile.REGTYPE) -> bytes:
+def archive(files) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for name, content in files.items():
             member = tarfile.TarInfo(name)
-            member.size, member.type = len(content), kind
-            if kind == tarfile.SYMTYPE:
-                member.size, member.linkname = 0, "/etc/passwd"
+            member.size = len(content)
             tar.addfile(member, io.BytesIO(content))
     return buffer.getvalue()
 
@@ -46,14 +40,10 @@ class Server(http.server.BaseHTTPRequestHandler):
     content = b""
     cuts: tuple[int, ...] = ()  # bytes after which the next connections break off
     requests = 0
-    raw = None  # an answer that is sent as it is
 
     def do_GET(self):
         cls = type(self)
         cls.requests += 1
-        if cls.raw is not None:
-            self.wfile.write(cls.raw)
-            return
         self.send_response(200)
         self.send_header("Content-Length", str(len(cls.content)))
         self.end_headers()
@@ -122,9 +112,7 @@ def test_changed_archive_is_refused(server, tmp_path, monkeypatch):
     ("content", "message"),
     [
         (archive({"../evil.txt": b"x"}), "OutsideDestinationError"),
-        (archive({MESH: b""}, tarfile.SYMTYPE), "AbsoluteLinkError"),
         (archive({"004_sugar_box/readme.txt": b"x"}), "found no such mesh"),
-        (archive({"004_sugar_box.stl": box_stl()}), "found no such mesh"),
         (archive({MESH: b"solid"}), "is not used"),
         (archive({MESH: box_stl((0.3, 0.1, 0.1))}), r"expected.*45 x 92 x 176 mm.*got 100 x 100 x 300 mm|Expected"),
         (b"not an archive", "is not used"),
@@ -170,21 +158,11 @@ def test_an_object_that_is_unknown_and_an_address_that_is_no_pattern(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-NOWHERE = {
-    **dict.fromkeys(["http://127.0.0.1:9/{code}", "nonsense", "http://[/x", "gopher://x/{code}", "file:///none"], b""),
-    "server: missing": b"HTTP/1.1 404 Not Found\r\n\r\n",
-    "server: elsewhere": b"HTTP/1.1 302 Found\r\nLocation: http://[\r\n\r\n",
-    "server: no number": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
-    "server: nothing": b"",
-}
-
-
-@pytest.mark.parametrize("url", NOWHERE)
-def test_an_address_that_leads_nowhere(server, tmp_path, monkeypatch, url):
+@pytest.mark.parametrize("url", ["http://127.0.0.1:9/{code}", "nonsense", "file:///none"])
+def test_an_address_that_leads_nowhere(tmp_path, monkeypatch, url):
     monkeypatch.setattr(assets, "ATTEMPTS", 1)
-    server.raw = NOWHERE[url]
-    with pytest.raises(AssetError, match="404.*Check the network" if "missing" in url else "Check the network"):
-        assets.download(["sugar_box"], tmp_path, server.url if "server" in url else url)
+    with pytest.raises(AssetError, match="Check the network"):
+        assets.download(["sugar_box"], tmp_path, url)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -197,20 +175,6 @@ def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
     with pytest.raises(AssetError, match="at most 1 MB unpacked"):
         fetch(server, tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_damaged_archives(server, tmp_path):
-    """Seeded: of the compressed stream, and of the tar inside it."""
-    rng = random.Random(0)
-    whole = archive({MESH: box_stl(), "004_sugar_box/readme.txt": b"x" * 600})
-    for i in range(120):
-        data = bytearray(whole if i % 2 else gzip.decompress(whole))
-        for _ in range(rng.choice((1, 3, 30))):
-            data[rng.randrange(min(len(data), rng.choice((512, 10_000))))] = rng.randrange(256)
-        server.content = bytes(data) if i % 2 else gzip.compress(bytes(data), 1)
-        with contextlib.suppress(AssetError):
-            fetch(server, tmp_path / str(i))
-        assert {path.name for path in (tmp_path / str(i)).glob(".*")} <= {".lock"}
 
 
 @pytest.mark.parametrize(
@@ -235,60 +199,21 @@ def test_a_folder_that_cannot_be_written(server, tmp_path):
         fetch(server, tmp_path)
 
 
-# --- several processes ------------------------------------------------------------------------------------------------
-
-DOWNLOAD = """
-import sys, pathlib
-from difflcs_envs import assets
-assets.download([sys.argv[1]], pathlib.Path(sys.argv[2]), sys.argv[3], print)
-"""
-
-
-def start(server, folder, name, program=DOWNLOAD):
-    command = [sys.executable, "-c", program, name, str(folder), server.url]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.fixture
-def objects(server):
-    """Serves two objects, slowly, each as a box of its size."""
-    names = ("sugar_box", "fish_can")
-    found = {YCB[n].code: archive({f"{YCB[n].code}/google_16k/nontextured.stl": box_stl(YCB[n].size)}) for n in names}
-    answer = server.do_GET
-
-    def do_get(self):
-        time.sleep(0.2)
-        type(self).content = found[self.path[1:].removesuffix(".tgz")]
-        answer(self)
-
-    server.do_GET = do_get
-    server.names = names
-    return server
-
-
-@pytest.mark.slow
-def test_processes_lose_nothing(objects, tmp_path):
-    """Two processes on one object and another one on another, at a time."""
-    running = [start(objects, tmp_path, name) for name in (*objects.names, objects.names[0])]
-    said = [process.communicate(timeout=120) for process in running]
-    assert [process.returncode for process in running] == [0] * 3, said
-    assert len(json.loads((tmp_path / "sha256.json").read_text())) == 2
-    assert objects.requests == 2  # the one that waited has found the archive
-    codes = {YCB[name].code for name in objects.names}
-    wanted = {*codes, *(f"{code}_google_16k.tgz" for code in codes), "sha256.json"}
-    assert {path.name for path in tmp_path.iterdir()} == wanted
+# --- several processes: how they wait is in test_envs_objects.py ------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_a_killed_download_is_no_obstacle(server, tmp_path):
     # Killed when the archive is unpacked and its mesh is about to be read.
-    program = f"import time, trimesh; trimesh.load = lambda *_, **__: time.sleep(60)\n{DOWNLOAD}"
-    with start(server, tmp_path, "sugar_box", program) as killed:
+    program = (
+        "import time, trimesh; trimesh.load = lambda *_, **__: time.sleep(60)\nfrom difflcs_envs.assets import *\n"
+    )
+    program += f"download(['sugar_box'], Path({str(tmp_path)!r}), {server.url!r})"
+    with subprocess.Popen([sys.executable, "-c", program]) as killed:
         deadline = time.monotonic() + 30
         while not list(tmp_path.glob(".download-*/004_sugar_box")) and time.monotonic() < deadline:
             time.sleep(0.05)
-        killed.send_signal(signal.SIGKILL)
-        killed.communicate()
+        killed.kill()
     assert (tmp_path / ".lock").exists()
     assert fetch(server, tmp_path)[0].is_file()
     assert {path.name for path in tmp_path.iterdir()} == {ARCHIVE, "004_sugar_box", "sha256.json"}

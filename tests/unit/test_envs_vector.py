@@ -1,4 +1,4 @@
-"""The vector environment, TorchRL, and libraries that expect Gymnasium."""
+"""The vector environment, and TorchRL."""
 
 import multiprocessing
 import pickle
@@ -185,14 +185,6 @@ def test_bad_actions(actions):
         envs.step(actions)
     with pytest.raises(ValueError, match="2 seeds"):
         envs.reset(seed=[1, 2, 3])
-
-
-def test_another_library_learns_a_little():
-    """Stable-Baselines3 where it is installed."""
-    import stable_baselines3 as sb3
-
-    env = gymnasium.wrappers.FlattenObservation(gymnasium.make(CUBE))
-    sb3.PPO("MlpPolicy", env, n_steps=40, batch_size=20, n_epochs=1, device="cpu").learn(40)
 
 
 @pytest.mark.parametrize(("task", "arguments"), [("cube", {}), ("clamp", {"object_source": "stand_in"}), (TURN, {})])

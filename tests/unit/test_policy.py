@@ -1,6 +1,5 @@
 """The stochastic policy as a TorchRL actor, on the small pushing system of `conftest`."""
 
-import doctest
 import math
 
 import pytest
@@ -9,7 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from difflcs import GoalCost, LCSModel, LCSMPCLayer
+from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.rl.learning.policy import LCSMPCPolicy
 
@@ -102,27 +101,3 @@ def test_what_is_learned(mpc):
 def test_bad_arguments(mpc, arguments, error, message):
     with pytest.raises(error, match=message):
         LCSMPCPolicy(**{"mpc": mpc, **arguments})
-
-
-@pytest.mark.filterwarnings(
-    "ignore:Creating .* which inherits from WeightUpdaterBase"
-)  # importing TorchRL's collectors
-@pytest.mark.filterwarnings("ignore:The env passed to Collector is missing transforms")  # of TorchRL 0.14 to 0.15
-def test_the_example_trains_in_plain_torchrl():
-    """The docstring's example is run: TorchRL's Collector, GAE, loss and optimiser, and our environment and policy."""
-    found = {"torch": torch}
-    before = LCSModel(9, 6, 8).state_dict()
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        exec(doctest.script_from_examples(LCSMPCPolicy.__doc__), found)
-    data, loss, lcs = found["data"], found["loss"], found["lcs"]
-    assert data.batch_size == (4, 20)
-    assert bool(data["next", "truncated"][:, -1].all())
-    moved = data["next", "state"][..., 3:] - data["state"][..., 3:]
-    assert 0.001 < float(moved.abs().mean()) < 0.015
-    assert float(loss["kl_approx"]) == pytest.approx(0, abs=1e-9)  # re-solved from the rollout's own plans
-    assert lcs.state_dict().keys() == before.keys()
-    for name, parameter in lcs.named_parameters():
-        assert bool(torch.isfinite(parameter.grad).all()), name
-        assert bool(parameter.grad.any()), name
-        assert float(parameter.detach().abs().max()) > 1e-3 or name == "c", name  # further than any initial value

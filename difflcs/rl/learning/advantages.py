@@ -1,20 +1,7 @@
 """Advantages: by generalised advantage estimation (GAE), or of many actions for each state.
 
-With q(s, a) = r(s, a) + γ V(s₊) and its mean q̄(s) over the policy's actions, an error of GAE (Eq. 5 of the paper) is
-
-    δ_t = [q(s_t, a_t) − q̄(s_t)] + b(s_t),  b = q̄ − V.
-
-In an advantage Σ_l (γζ)^l δ_{t+l} the brackets of later steps are noise: they average out over later actions. b(s_t) is
-noise too, as it is the same for all actions. Model rollouts can look a step ahead, so both can be left out. With many
-actions for each state,
-
-    A(s_t, a) = q(s_t, a) − q̄(s_t) + [a = a_t] M Σ_{l≥1} (γζ)^l b(s_{t+l})
-
-has the policy gradient of GAE in expectation, with the same V and ζ. The sum corrects the errors of V
-at the next states. It is known for the action taken only, so it has the weight of all M.
-
-The bracket, the advantage of the action taken (`action_advantage`), is also noise in the rewards that V is fitted to,
-and is subtracted from them.
+docs/training.md#multi-action-advantages derives the latter. The advantage of the action taken (`action_advantage`) is
+also noise in the rewards that V is fitted to, and is subtracted from them.
 """
 
 from __future__ import annotations

@@ -1,14 +1,11 @@
 """The policy that a training hands out: replaced only by one that did better in the robot's own episodes.
 
-A step of PPO follows networks, or the noisy gradient of a few episodes. Where a policy is good already, many such steps
-make it worse until later ones mend it. So PPO goes on learning as it does, and its policy takes the place of the
-incumbent only if its newest episodes had higher returns, by a one-sided test with two additions:
+Many steps of PPO make a good policy worse until later ones mend it. So PPO goes on learning as it does, and its policy
+takes the place of the incumbent only if its newest episodes had higher returns, by a one-sided test with two additions:
 
 - Episodes differ most by their goals. What the value network expects of a start is subtracted from its return.
 - A policy that fails in 3 % of its episodes fails in none of thirty as often as not. So the test counts one failed
   episode more than were seen, and few episodes do not replace what rarely fails.
-
-All of these episodes are collected for learning anyway, so the test costs no time on the robot.
 """
 
 from collections.abc import Callable

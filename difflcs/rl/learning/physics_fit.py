@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcp import solve_lcp
 from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
@@ -49,8 +48,6 @@ class PhysicsFitSettings(Settings):
     """Step size of Adam, which begins anew in each iteration."""
     last_rate: float = bounded(1.0, above=0, maximum=1)
     """Fraction of it at the end of an iteration, to which it falls linearly."""
-    loss: Literal["violation", "prediction"] = "violation"
-    """The violation loss, or the squared error of the next state through the relaxed contacts."""
     explained: float | None = bounded(None, above=0, maximum=1)
     """Share of transitions that count by their loss, the others by its logarithm, so that impacts do not dominate;
     None: all count by their loss."""
@@ -62,8 +59,7 @@ def physics_loss(
     u: Tensor,
     x_next: Tensor,
     scale: Tensor,
-    settings: PhysicsFitSettings,
-    relaxation: float,
+    explained: float | None = None,
     context: Tensor | None = None,
 ) -> Tensor:
     """Compute the loss of transitions of a system that depends on the state.
@@ -74,23 +70,18 @@ def physics_loss(
         u: (N, n_u) actions.
         x_next: (N, n_x) next states.
         scale: (n_x,) units in which errors of the states count.
-        settings: which loss.
-        relaxation: λ·s of the prediction; that of the MPC, so that it is the motion the MPC plans with.
+        explained: see `PhysicsFitSettings`.
         context: (N, n_context) or None.
 
     Returns:
-        Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units. With
-        `explained` a mean between the geometric and the arithmetic one.
+        Scalar: the mean violation loss in units of `scale`; with `explained` a mean between the geometric and the
+        arithmetic one.
     """
     system: Any = system_at(lcs, x, context)
-    if settings.loss == "violation":
-        losses = violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI, reduction="none")
-    else:
-        lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam
-        losses = 0.5 * ((system.next_state(x, u, lam) - x_next) / scale).square().sum(-1)
-    if settings.explained is None:
+    losses = violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI, reduction="none")
+    if explained is None:
         return losses.mean()
-    usual = losses.detach().quantile(settings.explained).clamp(min=1e-12)
+    usual = losses.detach().quantile(explained).clamp(min=1e-12)
     return usual * (losses / usual).log1p().mean().expm1()
 
 
@@ -144,7 +135,6 @@ class PhysicsFit(EpisodeTrainer):
         settings: settings.
         seed: of noise, goals and initial states.
         scale: (n_x,) see `PhysicsSpec`.
-        relaxation: of the MPC.
         total_episodes: of the whole training; the last iteration collects no more.
         episode_steps: steps of one episode.
 
@@ -161,14 +151,13 @@ class PhysicsFit(EpisodeTrainer):
         settings: PhysicsFitSettings,
         seed: int,
         scale: Tensor,
-        relaxation: float,
         total_episodes: int,
         episode_steps: int,
     ):
         needed = min(settings.rollouts, total_episodes)
         super().__init__(check_module(lcs, env), policy, seed, episode_steps, env, needed)
         self.lcs, self.settings = lcs, settings
-        self.scale, self.relaxation, self.total_episodes = scale, relaxation, total_episodes
+        self.scale, self.total_episodes = scale, total_episodes
 
     def step(self, after_step: AfterStep | None = None) -> PhysicsFitReport:
         """One iteration: collect, then fit.
@@ -211,7 +200,7 @@ class PhysicsFit(EpisodeTrainer):
             chosen = torch.from_numpy(np.sort(random.choice(len(data[0]), size, replace=False)))
             x, u, x_next = (part[chosen] for part in data)
             known = None if context is None else context[chosen]
-            loss = physics_loss(self.lcs, x, u, x_next, self.scale, self.settings, self.relaxation, known)
+            loss = physics_loss(self.lcs, x, u, x_next, self.scale, self.settings.explained, known)
             check_depends(loss)
             adam.zero_grad()
             loss.backward()

@@ -204,31 +204,7 @@ class LCSMPCPolicy(GaussianPolicy):
     Samples are reparametrised: the log-probability of a sample drawn with gradients does not depend on the mean.
     Collect under `torch.no_grad()`, as collectors do, and let the loss compute the log-probability anew.
 
-    Example:
-        A training step in plain TorchRL, without `difflcs.rl.PPO`:
-
-        >>> from torchrl.collectors import Collector
-        >>> from torchrl.envs import ClipTransform
-        >>> from torchrl.modules import MLP, ValueOperator
-        >>> from torchrl.objectives import ClipPPOLoss
-        >>> from torchrl.objectives.value import GAE
-        >>> from difflcs import LCSModel
-        >>> from difflcs.rl import LCSMPCPolicy, get_task
-        >>> from difflcs_envs.torchrl import make_env
-        >>> env = make_env("cube", num_envs=4)
-        >>> env.append_transform(ClipTransform(in_keys_inv=["action"], low=-0.015, high=0.015))
-        >>> lcs = LCSModel(n_x=9, n_u=6, n_lam=8, init_scale=1e-3)
-        >>> policy = LCSMPCPolicy(get_task("cube").make_policy(lcs))
-        >>> value = ValueOperator(MLP(13, 1, num_cells=[64, 64]).double(), in_keys=["state", "goal", "time_to_go"])
-        >>> gae = GAE(gamma=0.99, lmbda=0.95, value_network=value)
-        >>> ppo = ClipPPOLoss(policy, value, entropy_bonus=False)
-        >>> adam = torch.optim.Adam(ppo.parameters(), 6e-4)
-        >>> for data in Collector(env, policy, frames_per_batch=80, total_frames=80):  # 4 episodes
-        ...     gae(data)
-        ...     data["guess"] = data["plan"]
-        ...     loss = ppo(data)
-        ...     (loss["loss_objective"] + loss["loss_critic"]).backward()
-        ...     adam.step()
+    docs/rl_stacks.md trains it in plain TorchRL, without `difflcs.rl.PPO`.
 
     Args:
         mpc: the controller; the LCS in it is trained, if it is an `LCSModel` or another `LCSModule` that is a

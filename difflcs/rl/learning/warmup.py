@@ -198,7 +198,8 @@ class Warmup(EpisodeTrainer):
 
     Args:
         lcs: the model, an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; it is trained in place, and
-            `policy` must use the same object.
+            `policy` must use the same object. If it has `take_frame(x, u, x_next)` and that returns True for all data,
+            it has started anew, and the training call is a long one.
         policy: the MPC around it.
         env: as many environments in lockstep as an iteration has episodes, or more. A "context" in their observations
             is given to the model, in the MPC and in the loss.
@@ -241,9 +242,10 @@ class Warmup(EpisodeTrainer):
         self.buffer = append_episodes(self.buffer, episodes, self.settings.buffer)
         if isinstance(self.lcs, LCSModel) and self.lcs.action_support is not None:
             self.lcs.action_support.copy_(torch.stack(self.bounds))
-        first = self.iteration == 0 and not self.pretrained
-        epochs = self.settings.epochs.first if first else self.settings.epochs.each
         data, context = transitions(self.buffer), contexts(self.buffer)
+        take_frame: Any = getattr(self.lcs, "take_frame", lambda *_: False)
+        first = take_frame(*data) or (self.iteration == 0 and not self.pretrained)
+        epochs = self.settings.epochs.first if first else self.settings.epochs.each
         outcome = fit(self.lcs, *data, self.settings, epochs, self._minibatches, context=context)
         self.iteration += 1
         return WarmupReport(

@@ -1,17 +1,9 @@
 """Base classes of the methods, and their registry.
 
-    @register_method
-    @dataclass(frozen=True)
-    class Mine(LCSMethod):
-        name, version, summary, reports = "mine", 1, "…", (MyReport,)
-        epochs: int = bounded(10, minimum=1)
-
-        def trainer(self, work): ...
-
 A method is a frozen dataclass whose fields are its settings, with the recommended ones as defaults. Once its module is
 imported, `train(...)` and the command line know it: `difflcs train --method mine --epochs 20`, `evaluate`,
 `render`; and the conformance suite of the methods tests it. `LCSMethod` is the base of those that learn an `LCSModel`,
-`Method` of all others.
+`Method` of all others. docs/contributing.md adds one.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ class ContactMethod(Method):
         first = max(1, round(self.fit_minutes * task.steps_per_minute / task.episode_steps))
         count = min(first, work.total_episodes)
         scale = torch.tensor(spec.scale, dtype=torch.float64)
-        envs, relaxation = work.make_envs(min(self.fit.rollouts, count)), policy.setup().relaxation
-        fit = PhysicsFit(lcs, policy, envs, self.fit, work.seed, scale, relaxation, count, task.episode_steps)
+        envs = work.make_envs(min(self.fit.rollouts, count))
+        fit = PhysicsFit(lcs, policy, envs, self.fit, work.seed, scale, count, task.episode_steps)
         if count == work.total_episodes:
             return fit
         return LCSRL(

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.physics.frame import BodyFrameLCS
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
@@ -17,7 +16,7 @@ from difflcs.rl.settings import bounded, group
 
 @dataclass(frozen=True)
 class FrameMethod(LCSRLMethod):
-    """LCS-RL with a `BodyFrameLCS`: the warm-up, and then PPO if there is data left. For tasks that are `planar`."""
+    """LCS-RL with a `BodyFrameLCS`, whose frame the warm-up finds in its data; then PPO if there is data left."""
 
     warmup_minutes: float = bounded(3.0, above=0, maximum=1e6)
     """Data of the warm-up [min], at most half of all; the rest is the main phase's."""
@@ -31,8 +30,8 @@ class FrameMethod(LCSRLMethod):
     """Initial parameters are uniform within ± this, in units of the first data."""
 
     name: ClassVar[str] = "frame-lcs"
-    version: ClassVar[int] = 2
-    summary: ClassVar[str] = "LCS-RL in the frame of the body; told that the state is a pose and points of a plane"
+    version: ClassVar[int] = 3
+    summary: ClassVar[str] = "LCS-RL in the frame of a pushed body, which it finds in its data"
     kind: ClassVar[str] = BodyFrameLCS.kind
     takes_init: ClassVar[bool] = False
     model: ClassVar[type[LCSModel]] = BodyFrameLCS
@@ -43,17 +42,8 @@ class FrameMethod(LCSRLMethod):
         super(LCSRLMethod, self).check(minutes)
 
     def trainer(self, work: Work) -> Trainer:
-        """See `Method`: PPO follows only if data of more than an iteration are left after the warm-up.
-
-        Raises:
-            InvalidInputError: the state of the task is no pose and points of a plane.
-        """
+        """See `Method`: PPO follows only if data of more than an iteration are left after the warm-up."""
         task = work.task
-        if not task.planar:
-            raise InvalidInputError(
-                f"method: expected a planar task for {self.name}, got {task.name}; set `planar` in its TaskSpec if its "
-                f"state is the pose of a body and points of a plane, or learn it by lcs-rl"
-            )
         per_minute = task.steps_per_minute / task.episode_steps
         minutes = min(self.warmup_minutes, work.total_episodes / per_minute / 2)
         if work.total_episodes - minutes * per_minute >= self.warmup.rollouts.each:
