@@ -74,13 +74,13 @@ def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
     [
         {"inner": 3},
         {"inner": {"count": 3}},
-        {"pair": (0.1,)},
-        {"pair": 0.1},
+        *({"pair": wrong} for wrong in [(0.1,), (0.1, 0.2, 0.3), 0.1, ("a", "b")]),
         {"many": (1.5,)},
-        {"maybe": 1.5},
-        {"kind": "c"},
+        *({"maybe": wrong} for wrong in [1.5, True]),
+        *({"kind": wrong} for wrong in ["c", None]),
+        {"flag": 1},
         {"text": 1},
-        {"size": 1.0},
+        *({"size": wrong} for wrong in [1.0, True, "1"]),
     ],
 )
 def test_values_of_another_type_are_refused_by_name(values):
@@ -100,6 +100,7 @@ def test_integers_stand_for_floats_and_none_where_it_is_declared():
         ({"inner": {"count": 3}}, "fields"),
         ({"inner": {"count": 3, "share": 0.5, "more": 1}}, "fields"),
         ({"inner": {"count": 0, "share": 0.5}}, "count"),
+        *(({"inner": wrong}, "inner") for wrong in [[3, 0.5], None]),
         ({"another": 1}, "fields"),
         ({"pair": [0.1, 2.0]}, "pair"),
         ({"kind": "c"}, "kind"),
