@@ -15,8 +15,7 @@ Beyond the papers, `--axes any` turns by 30° to 90° about any axis, `--seconds
 reached, until the object falls or the time is over, and `--tilt 30` inclines the hand. They can be combined.
 
 The controller knows model and state, and tries each step in MuJoCo before it is executed. It has one set of settings,
-chosen with seeds below 1500; final figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE`
-episodes that are in the file are not played again: after a change of the controller begin another file.
+chosen with seeds below 1500; final figures are of seeds 5000 and up. Times are CPU times of one core.
 """
 
 import copy
@@ -85,7 +84,11 @@ class Settings:
     """Angle up to which a goal that is farther away pulls harder [rad]."""
     near: float = 8.0
     """Weight of the distances of fingertips from what they are to touch: the middle of the object, and after the hand
-    has opened points that are drawn in its box."""
+    has opened points that are drawn in its box; and of the thumb from its place behind the object."""
+    behind: float = 0.03
+    """So far towards the wrist it is from the object's place: nothing else can push the object back from there [m]."""
+    wide: float = 0.02
+    """Distance from its place at which an object is drawn there twice as hard for each metre as near it [m]."""
     effort: float = 0.2
     patience: int = 25
     """Decisions without progress after which the hand opens, and takes the object anew."""
@@ -126,7 +129,7 @@ class Options:
     json: bool = False
     """Print a line of JSON for each object and for all."""
     out: Path | None = None
-    """Where episodes are recorded, a line of JSON each; nowhere if not given."""
+    """Where episodes are recorded, a line of JSON each, and not played again: take another after a change."""
     results: Path | None = None
     """File for the figures of each object and of all, with their episodes."""
     settings: Settings = field(default_factory=Settings)
@@ -223,16 +226,12 @@ class HandPolicy:
             self.best, self.waited = min(left, self.best), 0
         if self.waited > self.settings.patience:
             self.best, self.waited = np.inf, -OPENING
-            self.posture = self.draw(0.0 if self.posture is None else 0.3)
+            self.posture = JOINTS + (0.0 if self.posture is None else 0.3) * self.random.randn(16)
             size = self.twin.geom_aabb[self.geom, 3:]
             if max(size) > LONG / 2:
                 self.aimed = self.place + self.random.uniform(*ASIDE)
             self.spots = self.random.uniform(-1, 1, (4, 3)) * size
         return self.waited < 0
-
-    def draw(self, spread: float) -> np.ndarray:
-        """Draw the posture to which the hand opens [rad]."""
-        return np.array(JOINTS) + spread * self.random.randn(16)
 
     def act(self, data: Any) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s."""
@@ -240,17 +239,18 @@ class HandPolicy:
             self.mpc.reset()
             last, ctrl = self.ctrl, self.rehearse(data, self.posture - data.qpos[:16], (1.0,))
             if ctrl is last:  # to open in this way does harm
-                self.posture = self.draw(0.3)
+                self.posture = JOINTS + 0.3 * self.random.randn(16)
             return ctrl
         marks = [time.thread_time()]
+        x, here = self.module.observe(data), data.qpos[-7:-4]
         grips = data.geom_xpos[self.geom] + self.spots @ data.geom_xmat[self.geom].reshape(3, 3).T
-        bounds: dict[str, Any] = {}
-        x = self.module.observe(data)
+        grips[3] = here - [self.settings.behind, 0.0, 0.0]  # the thumb's
         if self.aimed is not self.place and self.angle(data) < self.settings.turned:
             self.aim(self.goal)
-        if self.aimed is not self.place:
-            bounds = self.lay_flat(data, x)
-        goal = np.concatenate([self.aimed, self.goal, *grips])
+        bounds = {} if self.aimed is self.place else self.lay_flat(data, x)
+        off = self.aimed - here
+        beyond = off * min(1 + off @ off / self.settings.wide**2, 6.0)  # has the slope of the cost in `miss`
+        goal = np.concatenate([here + beyond, self.goal, *grips])
         action = self.mpc.step(x, goal, **bounds)  # which asks module and cost
         marks.append(time.thread_time())
         ctrl = self.rehearse(data, action, self.settings.paces)
@@ -269,14 +269,11 @@ class HandPolicy:
         return {"u_min": low, "u_max": high}
 
     def rehearse(self, data: Any, action: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
-        """Try a step at two paces in MuJoCo: the faster if it ends about as well as the slower, or none.
-
-        Where the faster ends worse, but does no great harm, the slower is executed untried: it mostly ends better.
-        """
+        """Try a step at two paces in MuJoCo: the faster if it ends about as well as the slower, or none."""
         s, now, tries, ends = self.settings, self.miss(data), [], []
         for pace in paces or (1.0,):
             tries.append(data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit))
-            safe = not s.paces or (ends != [] and now + s.slack < ends[-1] < now + s.worse)
+            safe = not s.paces or (ends != [] and now + s.slack < ends[-1] < now + s.worse)  # mostly better than it
             ends.append(now if safe else self.simulate(data, tries[-1]))
             if ends[-1] < now - s.gain:
                 break
@@ -296,8 +293,9 @@ class HandPolicy:
     def miss(self, data: Any) -> float:
         """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""
         s, left = self.settings, self.angle(data)
-        apart, near = data.qpos[-7:-4] + SECONDS * data.qvel[-6:-3] - self.aimed, min(left, s.reach)
-        return s.place * apart @ apart + s.turn * near * (2 * left - near)
+        square = float(np.sum((data.qpos[-7:-4] + SECONDS * data.qvel[-6:-3] - self.aimed) ** 2))
+        near = min(left, s.reach)
+        return s.place * square * (1 + square / (2 * s.wide**2)) + s.turn * near * (2 * left - near)
 
 
 def play(o: Options, name: str, seed: int) -> dict[str, Any]:
