@@ -77,9 +77,6 @@ def random_state(model, seed):
     return qpos, random.normal(size=model.nv)
 
 
-# --- the state ------------------------------------------------------------------------------------------------------
-
-
 def test_the_state_says_what_each_number_is():
     state = MujocoState(many_joints(), velocities=True)
     places = ["slide", "ball_rx", "ball_ry", "ball_rz", "joint2"]
@@ -131,9 +128,6 @@ def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
         mujoco.mj_differentiatePos(model, rate, 2 * eps, *ends)
         numeric[:, i] = rate
     np.testing.assert_allclose(T, numeric, atol=1e-8)
-
-
-# --- contacts -------------------------------------------------------------------------------------------------------
 
 
 def test_a_floor_that_nothing_in_the_plane_can_approach_is_left_out():
@@ -298,9 +292,6 @@ def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
     assert named.gap[:4].tolist() == pytest.approx([0.005] * 4)
 
 
-# --- quasi-static motion --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_it_is_the_planar_pushing_of_the_same_shapes(friction):
     gyration = float(np.sqrt((0.12**2 + 0.08**2) / 12))  # of the box's mass, which is that of its area
@@ -349,9 +340,6 @@ def test_an_actuator_is_a_servo_only_by_an_affine_bias():
     torch.testing.assert_close(module.control(tensor(0.3, 0.0, 0.0, 0.0), tensor(0.05)), tensor(0.05))
 
 
-# --- motion with velocities -----------------------------------------------------------------------------------------
-
-
 def test_forces_in_the_data_act_in_dynamic_motion_alone():
     model = load('<body><freejoint name="b"/><geom size=".05" mass="1"/></body>')
     data = mujoco.MjData(model)
@@ -366,9 +354,6 @@ def test_forces_in_the_data_act_in_dynamic_motion_alone():
     without = MujocoLCS(pushed, data).params(x).step(x, u).x_next
     data.xfrc_applied[:], data.qfrc_applied[:] = 10.0, 10.0
     torch.testing.assert_close(MujocoLCS(pushed, data).params(x).step(x, u).x_next, without)
-
-
-# --- as a module ----------------------------------------------------------------------------------------------------
 
 
 def test_single_precision_comes_back_single():

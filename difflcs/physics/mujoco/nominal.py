@@ -24,15 +24,15 @@ from difflcs.errors import ContactWarning
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
-from difflcs.physics.mujoco.limits import Rows, ScaledRows, find_load, follow, give_way, scale
+from difflcs.physics.mujoco.limits import Followed, Rows, ScaledRows, find_load, follow, give_way, scale
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
 _GAINS = 1.0  # of the speeds before the step and without contact, which contacts and limits do not make faster
-_EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
-_LATE = 10.0  # the most of the same, of what stiff drives press against a limit
+_ACTS = 0.6, 1.25  # part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
+_PRESSED = 0.4, 10.0  # the same of what drives press against a limit
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -231,18 +231,27 @@ def _settle(at: Situation, at_once: Array) -> tuple[ScaledRows, Array]:
     forces = rays.split(forces)[1]
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
     load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
-    after = follow(rows.gap, speed, load, rows.soft, h, step.motion.steps.count)
+    # The same with the action that presses a limit most.
+    far, fast = (rows.normal @ by for by in np.split(step.step[:, : 2 * nv, step.x.shape[1] : -1], 2, 1))
+    reach = step.motion.actuators.reach
+    faster = np.abs(fast) @ np.where(reach > 0, reach, 1.0)
+    harder = np.stack([np.zeros_like(faster), faster]) * (1 + h * load.drag) / h
+    gap, load = np.broadcast_to(rows.gap, harder.shape), load._replace(acceleration=load.acceleration - harder)
+    both = follow(gap, speed, load, rows.soft, h, step.motion.steps.count)
+    after, most = (Followed(*(v[i] for v in both)) for i in range(2))
     inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
     holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
     # A limit holds at the depth that it has after the step, friction after its creep.
     depth = np.minimum(rows.gap + after.moved, 0.0)
     gap = np.where(is_limit, rows.gap + 2 * rows.bend - depth, -after.moved * holds)
-    # What only another action brings to its limit is pressed there all the time: what holds its place stops it.
-    far, fast = (rows.normal @ by for by in np.split(step.step[:, : 2 * nv, step.x.shape[1] : -1], 2, 1))
-    pressed = ~holds & (np.abs(rows.gap) < np.abs(far).sum(-1)) & ~(after.acts & (rows.gap > 0))
-    late = (far * fast).sum(-1) / np.maximum(h * (fast * fast).sum(-1), 1e-300)
-    part = np.clip(after.part, _EARLY, 1.25)
-    part = np.where(is_limit & pressed, np.clip(late, _EARLY, _LATE), part)
+    # Between the nominal action and the one that presses it most, a limit gives way as MuJoCo's does on average.
+    late = np.where(holds, 1.0, (far * fast).sum(-1) / np.maximum(h * (fast * fast).sum(-1), 1e-300))
+    gives = (after.speed - most.speed) / np.maximum(faster, 1e-300)
+    pressed, part = is_limit & most.acts & (faster > 0) & ~at_once[:, None], np.clip(after.part, *_ACTS)
+    part = np.where(pressed, np.clip(late / np.maximum(1 - gives, 0.05), *_PRESSED), part)
+    # What is reached in the step has its gap where the force stops it as at the nominal action.
+    stopped = after.speed - (speed + h * load.acceleration[0]) / (1 + h * load.drag)
+    gap = np.where(pressed & after.acts & (rows.gap > 0), gap - (part - after.part) * h * stopped, gap)
     part = np.where(~is_limit & after.stops | at_once[:, None], 1.0, part)
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
