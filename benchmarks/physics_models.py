@@ -6,7 +6,8 @@ model: is it accepted, and if not, why; how far the velocity after one step of 2
 change of velocity, so that doing nothing has an error of 1. States are along a random motion, actions are random within
 the ranges of the actuators and within `action_bounds`. Medians are told for states that move freely, that have a
 contact, or where a joint or tendon is at its limit in this step. Beside them are those of differences: MuJoCo's own
-steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included.
+steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included. Both are also told with a
+nominal control near the action, nine tenths of the way, as that of a plan's next pass is.
 """
 
 import importlib.util
@@ -27,6 +28,7 @@ from difflcs.errors import DiffLCSError
 from difflcs.physics.mujoco import MujocoLCS
 
 SECONDS = 0.02  # of a step
+NEAR = 0.9  # of the way from the usual nominal control to the action
 MODELS = {  # package → its scenes; what does not load alone, or has no joint, is a part of others
     "dm_control": ["suite/*.xml"],
     "gymnasium": ["envs/mujoco/assets/*.xml"],
@@ -154,11 +156,6 @@ class Simulated:
         self.after = data.qvel.copy()
 
 
-def median(values: list[float]) -> float | None:
-    """None where there are none."""
-    return float(np.median(values)) if values else None
-
-
 @torch.no_grad()
 def measure(model: Any, o: Options, asked: dict[str, int] | None = None) -> dict[str, Any] | None:
     """Errors by kind, and the time of a state, with as many contacts and limits as a `ContactWarning` asks for.
@@ -191,18 +188,27 @@ def measure(model: Any, o: Options, asked: dict[str, int] | None = None) -> dict
         return measure(model, o, more)
     for w in said:
         warnings.warn(w.message, stacklevel=1)
-    predicted = system.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy()
-    errors: dict[str, dict[str, list[float]]] = {kind: {"lcs": [], "fd": []} for kind in ("free", "contact", "limit")}
+    near = zeros + NEAR * (actions - zeros)
+    systems = {"": (zeros, system), "near_": (near, module.params(x, near))}
+    predicted = {w: s.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy() for w, (_, s) in systems.items()}
+    errors: dict[str, dict[str, list[float]]] = {
+        kind: {f"{way}{of}": [] for way in systems for of in ("lcs", "fd")} for kind in ("free", "contact", "limit")
+    }
     for i, state in enumerate(states):
         true = Simulated(model, state, ctrl[i])
         change = np.linalg.norm(true.after - state[1])
         if change < 1e-6 or not np.isfinite(change):
             continue
-        base = Simulated(model, state, nominal[i], linearise=True)
-        differences = base.after + (base.by_ctrl @ (ctrl[i] - nominal[i]))[nv : 2 * nv]
-        for name, velocity in (("lcs", predicted[i]), ("fd", differences)):
-            errors[true.kind][name].append(float(np.linalg.norm(velocity - true.after) / change))
-    told = {kind: {"states": len(v["lcs"]), **{n: median(e) for n, e in v.items()}} for kind, v in errors.items()}
+        for way, (controls, _) in systems.items():
+            at = controls[i].numpy()
+            base = Simulated(model, state, at, linearise=True)
+            differences = base.after + (base.by_ctrl @ (ctrl[i] - at))[nv : 2 * nv]
+            for of, velocity in (("lcs", predicted[way][i]), ("fd", differences)):
+                errors[true.kind][way + of].append(float(np.linalg.norm(velocity - true.after) / change))
+    told = {
+        kind: {"states": len(v["lcs"]), **{n: float(np.median(e)) if e else None for n, e in v.items()}}
+        for kind, v in errors.items()
+    }
     return {"ms": 1e3 * seconds, "n_x": module.n_x, "n_u": module.n_u, "n_lam": module.n_lam, **told}
 
 
@@ -240,7 +246,7 @@ def main(o: Options) -> None:
 def describe(row: dict[str, Any]) -> str:
     """One line of a model."""
     kinds = (
-        f"{kind} {v['lcs']:.2f} ({v['fd']:.2f}; {v['states']})"
+        f"{kind} {v['lcs']:.2f} ({v['fd']:.2f}), near {v['near_lcs']:.2f} ({v['near_fd']:.2f}); {v['states']} states"
         for kind in ("free", "contact", "limit")
         if (v := row[kind])["states"]
     )

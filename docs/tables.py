@@ -301,17 +301,24 @@ def decision(record: dict) -> str:
     return table(["one decision", "computing", "PDDM takes"], rows)
 
 
+STEPS = {"free": ("free", ""), "contact": ("contact", ""), "limit": ("limit", ""), "limit, near": ("limit", "near_")}
+
+
+def told(errors: dict, way: str) -> str:
+    """Error of a step, and in brackets that of differences; linearised at the usual nominal control or `near_`."""
+    return f"{errors[way + 'lcs']:.2f} ({errors[way + 'fd']:.2f})"
+
+
 def foreign(record: dict) -> str:
     """Models by others: errors of a step and those of differences in brackets, by kind; a refusal in words."""
     rows = []
     for name, row in record["results"].items():
-        cells = ["", "", ""]
+        cells = ["", "", "", ""]
         if "refused" not in row:
-            few = [row[kind] for kind in ("free", "contact", "limit")]
-            cells = [f"{v['lcs']:.2f} ({v['fd']:.2f})" if v["states"] else "" for v in few]
+            cells = [told(row[kind], way) if row[kind]["states"] else "" for kind, way in STEPS.values()]
         time = duration(1e-3 * row["ms"]) if "ms" in row else row["refused"].replace("|", "\\|")
         rows.append([name.replace("_", "\\_"), *cells, time])
-    return table(["model", "free", "contact", "limit", "time of a state, or why it is refused"], rows)
+    return table(["model", *STEPS, "time of a state, or why it is refused"], rows)
 
 
 def summary(record: dict) -> str:
@@ -321,12 +328,12 @@ def summary(record: dict) -> str:
         some = [row for name, row in results.items() if package in ("", name.split("/")[0])]
         accepted = [row for row in some if "refused" not in row]
         cells = [package.replace("_", "\\_") or "all", f"{len(accepted)} of {len(some)}"]
-        for kind in ("free", "contact", "limit"):
+        for kind, way in STEPS.values():
             few = [row[kind] for row in accepted if row[kind]["states"] >= 5]
-            medians = [f"{np.median([v[of] for v in few]):.2f}" for of in ("lcs", "fd") if few]
-            cells.append(f"{medians[0]} ({medians[1]})" if few else "")
+            medians = {of: np.median([v[of] for v in few]) for of in (f"{way}lcs", f"{way}fd") if few}
+            cells.append(told(medians, way) if few else "")
         rows.append([*cells, duration(1e-3 * float(np.median([row["ms"] for row in accepted])))])
-    return table(["package", "accepted", "free", "contact", "limit", "time of a state"], rows)
+    return table(["package", "accepted", *STEPS, "time of a state"], rows)
 
 
 def success(record: dict) -> str:

@@ -40,7 +40,7 @@ class Actuators:
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
         usual: (nu,) size of actions where there is no range: 1, and none of a servo on a slide, for a metre.
-        reach: (nu,) size of actions: half of the range, or `usual`.
+        reach: (nu,) size of actions: half of the range, or 1.
         curved: (k,) those with a range whose force is not linear in the control, such as dampers and muscles.
     """
 
@@ -68,7 +68,7 @@ class Actuators:
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
         slides = self.holds & (self.dof >= 0) & (model.jnt_type[model.dof_jntid[self.dof]] == _SCALAR[0])
         self.usual = np.where(slides, 0.0, 1.0)
-        self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), self.usual)
+        self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
         plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))

@@ -415,7 +415,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
     zero = of.control(x, torch.zeros_like(idle))
     ends, usual = torch.from_numpy(of._actuators.range)[:, None] - zero, torch.from_numpy(of._actuators.usual)
-    other = torch.where(usual > 0, -zero, idle)
+    other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = torch.rand(_BETWEEN, 1, of.n_u, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

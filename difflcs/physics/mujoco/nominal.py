@@ -211,7 +211,7 @@ def solve_soft(
     return force
 
 
-def _settle(at: Situation, at_once: Array) -> tuple[ScaledRows, Array]:
+def _settle(at: Situation, at_once: NDArray[np.bool_]) -> tuple[ScaledRows, Array]:
     """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time.
 
     In the states `at_once` (n,) they act at the beginning of the step, as contacts do.
@@ -233,8 +233,7 @@ def _settle(at: Situation, at_once: Array) -> tuple[ScaledRows, Array]:
     load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
     # The same with the action that presses a limit most.
     far, fast = (rows.normal @ by for by in np.split(step.step[:, : 2 * nv, step.x.shape[1] : -1], 2, 1))
-    reach = step.motion.actuators.reach
-    faster = np.abs(fast) @ np.where(reach > 0, reach, 1.0)
+    faster = np.abs(fast) @ step.motion.actuators.reach
     harder = np.stack([np.zeros_like(faster), faster]) * (1 + h * load.drag) / h
     gap, load = np.broadcast_to(rows.gap, harder.shape), load._replace(acceleration=load.acceleration - harder)
     both = follow(gap, speed, load, rows.soft, h, step.motion.steps.count)
@@ -276,7 +275,7 @@ def evaluate_nominal(at: Situation) -> Nominal:
     return nominal
 
 
-def _evaluate(at: Situation, at_once: Array) -> tuple[Nominal, Array]:
+def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array]:
     """Do so, and return the velocities (n, nv) after the step; for states `at_once` (n,) see `_settle`."""
     step, contacts, recovery = at.step, at.contacts, at.recovery
     settled, held = _settle(at, at_once)
