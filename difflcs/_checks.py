@@ -57,6 +57,17 @@ def to_tensor(value: object) -> object:
     return torch.from_numpy(np.array(value, np.float64))
 
 
+def check_array(name: str, value: object) -> np.ndarray:
+    """Convert real numbers, also in a tensor or in lists, to a float64 array; NaN and infinity are allowed."""
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    except (TypeError, ValueError, RuntimeError) as error:  # ragged, or a tensor without numbers
+        raise DTypeError(f"{name}: expected numbers, got {describe(value)}; pass a NumPy array of floats") from error
+    if array.dtype.kind not in "fiu":
+        raise DTypeError(f"{name}: expected real numbers, got {describe(value)}; pass a NumPy array of floats")
+    return array.astype(np.float64, copy=False)
+
+
 def takes_arrays(function: Callable[P, R]) -> Callable[P, R]:
     """Make a function of tensors take NumPy arrays, too: see `to_tensor`."""
 
@@ -146,6 +157,14 @@ def all_finite(*values: Tensor) -> bool:
     if transforms_active() or not all([v.is_cpu for v in values]):
         return all(bool(torch.isfinite(v.detach()).all()) for v in values)
     return _kernels.all_finite([(v.detach() if v.requires_grad else v).numpy() for v in values])
+
+
+def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], remedy: str = "build one first") -> R:
+    """Refuse anything but an object of a class, or of one of some classes."""
+    if not isinstance(value, kind):
+        wanted = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        raise DTypeError(f"{name}: expected {wanted}, got {describe(value)}; {remedy}")
+    return value
 
 
 def check_finite(tensors: Mapping[str, Tensor]) -> None:
@@ -265,9 +284,9 @@ def check_threads(value: int | None, name: str = "threads") -> None:
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Check one of a few words."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r:.200}")
-    return str(value)
+    return value
 
 
 def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:

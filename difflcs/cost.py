@@ -9,7 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe, takes_arrays
+from difflcs._checks import (
+    check_array,
+    check_kind,
+    check_number,
+    check_positive_int,
+    check_same_device,
+    check_tensor,
+    describe,
+    takes_arrays,
+)
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._fields import TensorFields, check_by_stage, check_stages
 from difflcs._linalg import matvec, quadratic
@@ -244,12 +253,8 @@ def cost_at(
         DTypeError: it returns anything but a cost.
     """
     value = fresh(cost).at(x, goal, context)
-    if not isinstance(value, QuadraticCost | CostSequence):
-        raise DTypeError(
-            f"cost: expected QuadraticCost or CostSequence from {type(cost).__name__}.at, got {describe(value)}; "
-            f"return one of them"
-        )
-    return value
+    remedy = f"return one of them from {type(cost).__name__}.at"
+    return check_kind("cost", value, (QuadraticCost, CostSequence), remedy)
 
 
 def _check_convex(name: str, matrix: Tensor) -> None:
@@ -451,7 +456,13 @@ class GoalCost(TensorFields):
                 f"goal_weight_final: expected {len(weights)} weights like goal_weight, got {len(finals)}; "
                 f"use 0 where a component does not count"
             )
-        pairs = list(pairs)
+        pairs = list(pairs) if isinstance(pairs, Iterable) else [pairs]
+        numbers = check_array("pairs", pairs)
+        apart = not pairs or (numbers.shape[1:] == (2,) and bool((numbers[:, 0] != numbers[:, 1]).all()))
+        if not (apart and np.isin(numbers, np.arange(n_x)).all()):
+            raise InvalidInputError(
+                f"pairs: expected pairs of two different indices in 0…{n_x - 1}, got {describe(pairs)}; correct them"
+            )
         stage, to_q, constant = _tracking(n_x, weights, pairs, check_number("pair_weight", pair_weight), dtype)
         final, to_q_final, constant_final = _tracking(
             n_x, finals, pairs, check_number("pair_weight_final", final_pair), dtype
@@ -471,7 +482,7 @@ def _weights(name: str, value: float | Sequence[float], n_x: int) -> list[float]
 
 
 def _tracking(
-    n_x: int, weights: list[float], pairs: list[tuple[int, int]], pair_weight: float, dtype: torch.dtype
+    n_x: int, weights: list[float], pairs: Sequence[tuple[int, int]], pair_weight: float, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute Q, G and K of the tracking terms ½xᵀQx + (G goal)ᵀx + ½goalᵀK goal."""
     n_goal = len(weights)
@@ -480,9 +491,7 @@ def _tracking(
     Q[:n_goal, :n_goal] = diagonal
     to_q = torch.zeros(n_x, n_goal, dtype=dtype)
     to_q[:n_goal] = -diagonal
-    for i, j in pairs:
-        if not (0 <= i < n_x and 0 <= j < n_x and i != j):
-            raise InvalidInputError(f"pairs: expected two different indices in 0…{n_x - 1}, got ({i}, {j})")
+    for i, j in ((int(i), int(j)) for i, j in pairs):
         difference = torch.zeros(n_x, dtype=dtype)
         difference[i], difference[j] = 1.0, -1.0
         Q += 2 * pair_weight * torch.outer(difference, difference)

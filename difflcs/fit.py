@@ -12,10 +12,19 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor, takes_arrays
+from difflcs._checks import (
+    check_array,
+    check_dims,
+    check_number,
+    check_positive_int,
+    check_tensor,
+    describe,
+    takes_arrays,
+)
 from difflcs._optional import require
 from difflcs.errors import InvalidInputError, ShapeError
-from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, check_inputs, system_at
+from difflcs.losses import params_of_transitions
+from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, system_at
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,7 +65,15 @@ class Transitions(NamedTuple):
             InvalidInputError: there are no transitions.
         """
         if episode is None:
-            pairs = [(_rows("states", s), _rows("actions", u)) for s, u in zip(states, actions, strict=True)]
+            each = [
+                [_rows(name, v) for v in (value if isinstance(value, Iterable) else [value])]
+                for name, value in (("states", states), ("actions", actions))
+            ]
+            if len(each[0]) != len(each[1]):
+                raise ShapeError(
+                    f"actions: expected {len(each[0])} episodes like the states, got {len(each[1])}; pair them"
+                )
+            pairs = list(zip(*each, strict=True))
         else:
             s, u, number = _rows("states", states), _rows("actions", actions), np.asarray(episode)
             if not len(s) == len(u) == number.size:
@@ -68,6 +85,8 @@ class Transitions(NamedTuple):
             cuts = [0, *ends.tolist(), len(s)]
             pairs = [(s[a:b], u[a : b - 1]) for a, b in itertools.pairwise(cuts)]
         for k, (s, u) in enumerate(pairs):
+            for name, value, first in zip(("states", "actions"), (s, u), pairs[0], strict=True):
+                check_tensor(f"{name}[{k}]", value, [("n", first.shape[1])])
             if len(s) != len(u) + 1:
                 raise ShapeError(
                     f"states[{k}]: expected one state more than the {len(u)} actions, got {len(s)}; keep the first and "
@@ -93,7 +112,8 @@ class Transitions(NamedTuple):
                 f"share: expected less than 1 of at least two episodes, got {share:g} of {count}; "
                 f"split one long episode by hand"
             )
-        drawn = np.random.default_rng(seed).permutation(count)[: min(max(1, round(share * count)), count - 1)]
+        random = np.random.default_rng(check_positive_int("seed", seed, minimum=0))
+        drawn = random.permutation(count)[: min(max(1, round(share * count)), count - 1)]
         test = torch.isin(number, torch.as_tensor(drawn, device=number.device))
         return Transitions(*(v[~test] for v in self)), Transitions(*(v[test] for v in self))
 
@@ -197,8 +217,7 @@ def fit_report(
     """
     horizon = check_positive_int("horizon", horizon)
     with torch.no_grad():
-        check_tensor("x", x, [("n_x", system.n_x)])
-        check_inputs(system.n_x, system.n_u, x, {"x": x, "u": u, "x_next": x_next}, owner="state x")
+        params = params_of_transitions(system, x, u, x_next, context)
         if not x.ndim == u.ndim == x_next.ndim == 2 or not len(x) == len(u) == len(x_next) > 1:
             shapes = ", ".join(str(tuple(v.shape)) for v in (x, u, x_next))
             raise ShapeError(f"x, u, x_next: expected (N, n) of the same N > 1 transitions, got {shapes}")
@@ -206,16 +225,12 @@ def fit_report(
         def at(rows: Tensor | slice, x: Tensor) -> LCSParams:
             if isinstance(system, LCSParams):
                 return system
-            params = system_at(system, x, None if context is None else context[rows])
-            if not isinstance(params, LCSParams):
-                raise InvalidInputError("system: expected one system for each state, got a sequence; report on a stage")
-            return params
+            return system_at(system, x, None if context is None else context[rows])  # pyright: ignore[reportReturnType]
 
-        everything = slice(None)
-        params, move = at(everything, x), x_next - x
+        move = x_next - x
         step, spread = (_positive(v) for v in (_rms(move), x.std(0, correction=0)))
         prediction = advance(params, x, u)
-        solution = _least_squares(*(train or (x, u, x_next)))
+        solution = _least_squares(*_check_training(train or (x, u, x_next), x, u))
 
         squared = ((prediction.x_next - x_next) / step).square().sum(1)
         lam, without = prediction.lam, []
@@ -250,7 +265,7 @@ def fit_report(
 
 def _rows(name: str, value: Any) -> Tensor:
     """Convert rows of numbers to a finite matrix in float64."""
-    rows = value.detach().double() if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, np.float64))
+    rows = value.detach().double() if isinstance(value, Tensor) else torch.from_numpy(check_array(name, value))
     if rows.ndim != 2:
         raise ShapeError(f"{name}: expected rows (T, n), got shape {tuple(rows.shape)}; give one row for each step")
     return check_tensor(name, rows)
@@ -271,6 +286,16 @@ def _keep_forces(params: LCSParams, kept: Sequence[int]) -> LCSParams:
                 value = value.index_select(value.ndim - len(dims) + place, torch.as_tensor(kept, device=value.device))
         values[name] = value
     return LCSParams(**values)
+
+
+def _check_training(train: Any, x: Tensor, u: Tensor) -> Sequence[Tensor]:
+    """Check transitions that something was fitted to, and convert them like these states and actions."""
+    if not isinstance(train, Sequence) or len(train) != 3:
+        raise InvalidInputError(f"train: expected x, u and x_next, got {describe(train)}; give three tensors")
+    train = [_rows(f"train {name}", value).to(x) for name, value in zip(("x", "u", "x_next"), train, strict=True)]
+    for name, value, like in zip(("x", "u", "x_next"), train, (x, u, x), strict=True):
+        check_dims(f"train {name}", value, [("N", len(train[0])), ("n", like.shape[1])])
+    return train
 
 
 def _regressors(x: Tensor, u: Tensor) -> Tensor:

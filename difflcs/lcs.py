@@ -14,10 +14,10 @@ from difflcs import _storage
 from difflcs._checks import (
     broadcast_batch,
     check_choice,
+    check_kind,
     check_number,
     check_positive_int,
     check_tensor,
-    describe,
     takes_arrays,
 )
 from difflcs._differentiation import runs_eagerly, transforms_active
@@ -136,13 +136,14 @@ class LCSModel(PredictiveModule):
         self.n_lam = check_positive_int("n_lam", n_lam, minimum=0)
         self.stiffness = check_number("stiffness", stiffness, strict=True)
         init_scale = check_number("init_scale", init_scale)
+        check_kind("generator", generator, (torch.Generator, type(None)), "torch.Generator().manual_seed(0)")
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         for name, shape in self._shapes(self.n_x, self.n_u, self.n_lam).items():
             draw = torch.rand(shape, generator=generator, dtype=torch.float64)
             value = torch.zeros(shape) if name == "c" else init_scale * (2 * draw - 1)
             self.register_parameter(name, nn.Parameter(value.to(dtype)))
-        self.c.requires_grad_(learn_c)
+        self.c.requires_grad_(check_kind("learn_c", learn_c, bool))
         if action_support is not None:
             action_support = _check_support(action_support, self.n_u).to(dtype, copy=True)
         self.register_buffer("action_support", action_support)
@@ -211,6 +212,7 @@ class LCSModel(PredictiveModule):
         Returns:
             A model whose `params()` equal `params` up to rounding.
         """
+        check_kind("params", params, LCSParams)
         if len(params.batch_shape):
             raise ShapeError(f"params: expected no batch dimensions, got {tuple(params.batch_shape)}; index one system")
         params = params.detach()
@@ -262,10 +264,7 @@ class LCSModel(PredictiveModule):
             n_x, n_u = (check_positive_int(k, config[k]) for k in ("n_x", "n_u"))
             n_lam = check_positive_int("n_lam", config["n_lam"], minimum=0)
             stiffness = check_number("stiffness", config["stiffness"], strict=True)
-            if not isinstance(config["learn_c"], bool):
-                raise DTypeError(
-                    f"learn_c: expected true or false, got {describe(config['learn_c'])}; save the model again"
-                )
+            learn_c = check_kind("learn_c", config["learn_c"], bool, "save the model again")
         except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
@@ -274,7 +273,7 @@ class LCSModel(PredictiveModule):
         _storage.check_tensors(source, "a model", tensors, {name: (shape, dtype) for name, shape in shapes.items()})
         support = tensors.get("action_support")
         try:
-            model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype, action_support=support)
+            model = cls(n_x, n_u, n_lam, stiffness, learn_c=learn_c, dtype=dtype, action_support=support)
             model.load_state_dict(dict(tensors))
         except BoundsError as error:
             raise CheckpointError(f"{source}: its action support cannot be used: {error}") from error

@@ -8,7 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array, takes_arrays
+from difflcs._checks import (
+    broadcast_batch,
+    check_choice,
+    check_kind,
+    check_number,
+    check_tensor,
+    describe,
+    is_array,
+    takes_arrays,
+)
 from difflcs._differentiation import Gradients, Solver, Tensors, runs_eagerly, solve, transforms_active
 from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
@@ -96,7 +105,7 @@ def violation_loss(
             check_tensor(name, value)
         batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
     else:
-        params, factors = _params(lcs, x, u, x_next, context), ()
+        params, factors = params_of_transitions(lcs, x, u, x_next, context), ()
         if not params.n_lam:
             return _prediction_loss(params, x, u, x_next, reduction)
         batch = _batch(params, x, u, x_next)
@@ -132,7 +141,7 @@ def prediction_loss(
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
     """
     check_choice("reduction", reduction, ("mean", "none"))
-    return _prediction_loss(_params(lcs, x, u, x_next, context), x, u, x_next, reduction)
+    return _prediction_loss(params_of_transitions(lcs, x, u, x_next, context), x, u, x_next, reduction)
 
 
 def _prediction_loss(params: LCSParams, x: Tensor, u: Tensor, x_next: Tensor, reduction: str) -> Tensor:
@@ -146,7 +155,9 @@ def _reduce(loss: Tensor, batch: torch.Size, reduction: str) -> Tensor:
     return loss.sum() / max(loss.numel(), 1) if reduction == "mean" else loss.reshape(batch)
 
 
-def _params(lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, context: Tensor | None) -> LCSParams:
+def params_of_transitions(
+    lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, context: Tensor | None
+) -> LCSParams:
     """Return the system of some transitions, after a check that they fit it."""
     if context is not None:
         check_tensor("context", context)
@@ -160,11 +171,8 @@ def _params(lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, co
     elif isinstance(lcs, LCSModule):
         check_tensor("x", x, [("n_x", lcs.n_x)])
         params = system_at(lcs, x, context)
-        if not isinstance(params, LCSParams):
-            raise DTypeError(
-                f"{type(lcs).__name__}.params: expected LCSParams for transitions, which have no stages, got "
-                f"{type(params).__name__}; give the system of each transition by batch dimensions"
-            )
+        remedy = "transitions have no stages: give the system of each by batch dimensions"
+        params = check_kind(f"{type(lcs).__name__}.params", params, LCSParams, remedy)
     else:
         raise DTypeError(
             f"lcs: expected an LCSModel, another LCSModule or LCSParams, got {describe(lcs)}; the stages of a "

@@ -22,7 +22,7 @@ from difflcs._checks import (
     takes_arrays,
     to_tensor,
 )
-from difflcs._differentiation import runs_eagerly
+from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
 from difflcs._modules import fresh
 from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError
@@ -73,9 +73,9 @@ class SystemMatrices:
         return gap if lam is None else gap + matvec(self.F, lam)
 
 
-def _version(tensor: Tensor) -> int:
-    """Return how often a tensor was changed in place, if torch counts it."""
-    return 0 if tensor.is_inference() else tensor._version
+def _numbers_of(tensor: Tensor) -> int | None:
+    """Return a number that says whether the numbers of a tensor have changed; None where they cannot be read."""
+    return None if is_wrapped(tensor) else hash(tensor.detach().cpu().numpy().tobytes())
 
 
 # Name → kinds of its dimensions, in the order of every list of these matrices.
@@ -126,22 +126,22 @@ class _Record(SystemMatrices):
                 )
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
-        vars(self)["_version"] = _version(self.F)
+        vars(self)["_checked"] = _numbers_of(self.F)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({describe_shapes(self.tensors())})"
 
     def check_again(self) -> None:
         """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
-        if vars(self).get("_version") != _version(self.F):
+        if vars(self).get("_checked") != (now := _numbers_of(self.F)):
             check_positive_definite(self.F)
-            vars(self)["_version"] = _version(self.F)
+            vars(self)["_checked"] = now
 
     @classmethod
     def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
         """Make a record of tensors that have been checked, all of them and together; nothing is checked here."""
         record = object.__new__(cls)
-        vars(record).update(tensors, _version=_version(tensors["F"]))
+        vars(record).update(tensors, _checked=_numbers_of(tensors["F"]))
         return record
 
     @classmethod
@@ -453,7 +453,7 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
             raise DTypeError(f"lcs: expected LCSParams from {type(lcs).__name__}.params, got {describe(system)}")
         systems.append(system)
         with torch.no_grad():
-            x = advance(system, x, u[..., k, :]).x_next
+            x = advance(system, *(v.to(system.A.dtype) for v in (x, u[..., k, :]))).x_next.to(x)
     return LCSSequence.stack(systems)
 
 

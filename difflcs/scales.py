@@ -12,10 +12,19 @@ import torch
 from torch import Tensor
 
 from difflcs import _storage
-from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, describe, takes_arrays
+from difflcs._checks import (
+    broadcast_batch,
+    check_kind,
+    check_number,
+    check_same_device,
+    check_tensor,
+    describe,
+    takes_arrays,
+    to_tensor,
+)
 from difflcs._linalg import matvec
 from difflcs._modules import plain_state
-from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.errors import CheckpointError, InvalidInputError, ShapeError
 from difflcs.lcs import LCSModel, PredictiveModule
 from difflcs.records import LCSModule, LCSParams, LCSSequence, system_at
 
@@ -49,6 +58,19 @@ class Scales:
     xi: float
     relaxation: float
 
+    def __post_init__(self) -> None:
+        for name in ("center", "state", "action"):
+            value = check_tensor(name, to_tensor(getattr(self, name)))
+            if value.ndim != 1 or (name == "state" and value.shape != self.center.shape):
+                raise ShapeError(
+                    f"{name}: expected a number for each state or action, got {describe(value)}; see Scales"
+                )
+            if name != "center" and not bool((value > 0).all()):
+                raise InvalidInputError(f"{name}: expected units above 0, got {describe(value)}; 1 where none is known")
+            vars(self)[name] = value
+        for name in ("xi", "relaxation"):
+            vars(self)[name] = check_number(name, getattr(self, name), strict=True)
+
     @takes_arrays
     def normalise(self, x: Tensor, u: Tensor, x_next: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Convert transitions x (..., n_x), u (..., n_u), x_next (..., n_x) to these units."""
@@ -67,6 +89,7 @@ class Scales:
         A = S Ã S⁻¹, B = S B̃ U⁻¹, C = S C̃, d = S d̃ + m − A m, D = D̃ S⁻¹, E = Ẽ U⁻¹, F = F̃, c = c̃ − D m, with m, S and
         U from center, state and action.
         """
+        check_kind("params", params, (LCSParams, LCSSequence))
         m, S, U = (v.to(params.A) for v in (self.center, self.state, self.action))
         if (params.n_x, params.n_u) != (len(S), len(U)):
             raise InvalidInputError(
@@ -150,6 +173,8 @@ class ScaledLCS(PredictiveModule):
 
     def __init__(self, lcs: LCSModule, scales: Scales):
         super().__init__()
+        check_kind("lcs", lcs, LCSModule)
+        check_kind("scales", scales, Scales)
         self.lcs, self.scales = lcs, scales
         self.n_x, self.n_u, self.n_lam = lcs.n_x, lcs.n_u, lcs.n_lam
 
@@ -164,14 +189,11 @@ class ScaledLCS(PredictiveModule):
         Raises:
             DTypeError: the module within is no `LCSModel`; save its `state_dict` and the scales yourself.
         """
-        if not isinstance(self.lcs, LCSModel):
-            raise DTypeError(
-                f"lcs: expected an LCSModel within, got {describe(self.lcs)}; save its state_dict() and the scales"
-            )
+        lcs = check_kind("lcs", self.lcs, LCSModel, "save its state_dict() and the scales")
         tensors = {f"scales.{name}": getattr(self.scales, name) for name in ("center", "state", "action")}
-        tensors |= {f"lcs.{name}": value for name, value in plain_state(self.lcs).items()}
+        tensors |= {f"lcs.{name}": value for name, value in plain_state(lcs).items()}
         numbers = {"xi": self.scales.xi, "relaxation": self.scales.relaxation}
-        _storage.save_record(Path(directory), "ScaledLCS", {"lcs": self.lcs.config(), **numbers}, tensors)
+        _storage.save_record(Path(directory), "ScaledLCS", {"lcs": lcs.config(), **numbers}, tensors)
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike[str]) -> ScaledLCS:

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs import _storage
-from difflcs._checks import check_finite, check_number, describe
+from difflcs._checks import check_array, check_finite, check_number, describe
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.constraints import check_bounds
 from difflcs.cost import GoalCost
-from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
+from difflcs.errors import CheckpointError, InvalidInputError, NonFiniteError, ShapeError, SolveError
 from difflcs.mpc.controller_file import (
     check_constant,
     constant_setup,
@@ -141,6 +141,7 @@ class MPCController:
     def _make(self, inputs: Inputs) -> None:
         """Make the native controller of the first problem."""
         assert self._setup is not None
+        check_finite({name: inputs.tensors[name] for name in SYSTEM})
         problem, self._constant = make_problem(self._setup, inputs)
         self._content = controller_bytes(self._setup, problem, self._constant)
         self._first_inputs = {name: getattr(problem, name).clone() for names in _CHANGES.values() for name in names}
@@ -354,12 +355,7 @@ def _numbers(name: str, value: object, shape: tuple[int, ...]) -> NDArray[np.flo
     """Convert an argument to a float64 array for the native code; NaN and infinity are allowed."""
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == shape and value.flags.c_contiguous:
         return value
-    try:
-        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-    except (TypeError, ValueError) as error:
-        raise DTypeError(f"{name}: expected numbers, got {describe(value)}; pass a NumPy array") from error
-    if array.dtype.kind not in "fiu":
-        raise DTypeError(f"{name}: expected real numbers, got {describe(value)}; pass a NumPy array of floats")
+    array = check_array(name, value)
     if array.shape != shape:
         raise ShapeError(f"{name}: expected shape {shape}, got {array.shape}; give one robot's, without a batch")
-    return np.ascontiguousarray(array, np.float64)
+    return np.ascontiguousarray(array)

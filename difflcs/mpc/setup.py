@@ -13,6 +13,7 @@ from torch import Tensor
 from difflcs._checks import (
     broadcast_batch,
     check_finite,
+    check_kind,
     check_positive_definite,
     check_same_device,
     check_tensor,
@@ -133,11 +134,8 @@ def cost_along(
     x = along.x.detach()
     x = torch.cat([x0.expand(x[..., 0, :].shape).unsqueeze(-2), x[..., 1:, :]], -2)
     found = cost_at(cost, x, *(None if value is None else value.unsqueeze(-2) for value in (goal, context)))
-    if not isinstance(found, QuadraticCost):
-        raise DTypeError(
-            f"cost: expected QuadraticCost from {type(cost).__name__}.at along a plan, got {describe(found)}; return "
-            f"one, or set its attribute local = False"
-        )
+    remedy = f"return one from {type(cost).__name__}.at along a plan, or set its attribute local = False"
+    found = check_kind("cost", found, QuadraticCost, remedy)
     fields, by_stage = {}, []
     for name, value in found.tensors().items():
         dim = value.ndim - 1 - RANKS.get(name, 0)  # of the states
@@ -243,20 +241,12 @@ def check_context(context: Tensor | None, system: System, cost: Cost) -> None:
 
 def check_constraints(constraints: object) -> Constraints:
     """Refuse anything but constraints."""
-    if not isinstance(constraints, LinearConstraints | ConstraintSequence):
-        raise DTypeError(
-            f"constraints: expected LinearConstraints or ConstraintSequence, got {describe(constraints)}; build one "
-            f"from G and g"
-        )
-    return constraints
+    return check_kind("constraints", constraints, (LinearConstraints, ConstraintSequence), "build one from G and g")
 
 
 def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
     """Refuse anything but `StageBounds`, and bounds that are passed twice."""
-    if not isinstance(bounds, StageBounds):
-        raise DTypeError(
-            f"bounds: expected StageBounds, got {describe(bounds)}; pass constant bounds as u_min and u_max"
-        )
+    bounds = check_kind("bounds", bounds, StageBounds, "pass constant bounds as u_min and u_max")
     for name, value in plain.items():
         if value is not None:
             raise ShapeError(f"{name}: expected none with bounds, got {describe(value)}; put it into the StageBounds")
@@ -287,11 +277,8 @@ class Inputs:
             system = lcs
         else:
             system = system_at(lcs, x0, context) if along is None else sequence_along(lcs, along, x0, context)
-            if not isinstance(system, LCSParams | LCSSequence):
-                raise DTypeError(
-                    f"lcs: expected LCSParams or LCSSequence from {type(lcs).__name__}.params, got {describe(system)}; "
-                    f"return one of them"
-                )
+            returned = f"return one of them from {type(lcs).__name__}.params"
+            system = check_kind("lcs", system, (LCSParams, LCSSequence), returned)
         system.check_again()
         if isinstance(system, LCSSequence):
             self.check_horizon("lcs", system.horizon)

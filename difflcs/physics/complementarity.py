@@ -327,7 +327,7 @@ def _check_more(unilateral: Unilateral | None, bounded: Bounded | None, n_x: int
             if value is not None:
                 kinds = {"normal": [n, of_state], "slide": [n, of_state], "effect": [of_state, n]}
                 check_tensor(f"{name}.{field}", value, kinds.get(field, [n]))
-    if bounded is not None and bool((bounded.lower > bounded.upper).any()):
+    if bounded is not None and not is_wrapped(crossed := bounded.lower > bounded.upper) and bool(crossed.any()):
         raise InvalidInputError(
             "bounded.lower: expected at most the upper bound, got more; exchange them, or give both the same value"
         )
@@ -337,7 +337,7 @@ def _per_row(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Ten
     """Expand a coefficient to one for each contact, or each row."""
     value = torch.as_tensor(value, dtype=gap.dtype, device=gap.device)
     bad = value <= 0 if strict else value < 0
-    if bool(bad.any()) or not bool(torch.isfinite(value).all()):
+    if not is_wrapped(value) and (bool(bad.any()) or not bool(torch.isfinite(value).all())):
         limit = "above 0" if strict else "of at least 0"
         raise InvalidInputError(
             f"{name}: expected finite numbers {limit}, got {float(value.min()):g}; give one for all contacts "
@@ -377,7 +377,7 @@ _LARGE_DRAG = 0.25
 
 def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
     """Warn of a drag that by itself holds back more than a quarter of a slide, in the median state."""
-    if is_wrapped(drag) or not W.numel() or not bool((mu > 0).any()):
+    if is_wrapped(drag) or not W.numel() or not (is_wrapped(mu) or bool((mu > 0).any())):
         return
     mobility = W.detach()[..., normals + 1, normals + 1].amax(-1)
     part = float((drag.detach() * mobility).median())

@@ -1,16 +1,16 @@
 """ContactLCS: contact physics whose numbers are learned."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import describe
+from difflcs._checks import check_kind
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.errors import InvalidInputError
 from difflcs.physics.planar import PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Polygon, Shape, Union
 from difflcs.records import LCSParams
@@ -42,10 +42,9 @@ class ContactLCS(nn.Module):
 
     def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-2]):
         super().__init__()
-        if not isinstance(physics, PlanarPushing):
-            raise DTypeError(f"physics: expected a PlanarPushing, got {describe(physics)}; build one from shapes")
-        self.learn = tuple(learn)
-        unknown = [name for name in self.learn if name not in LEARNABLE]
+        check_kind("physics", physics, PlanarPushing, "build one from shapes")
+        self.learn = tuple(learn) if isinstance(learn, Iterable) else (learn,)
+        unknown = [name for name in self.learn if not isinstance(name, str) or name not in LEARNABLE]
         if unknown or len(set(self.learn)) < len(self.learn) or isinstance(learn, str):
             raise InvalidInputError(
                 f"learn: expected some of {', '.join(LEARNABLE)}, each once, got {learn!r:.200}; name what is uncertain"

@@ -15,6 +15,7 @@ of gyration ρ of the pressure under it; only this ratio matters where discs go 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -22,10 +23,18 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs._differentiation import runs_eagerly
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs._checks import (
+    check_array,
+    check_choice,
+    check_kind,
+    check_number,
+    check_positive_int,
+    check_tensor,
+)
+from difflcs._differentiation import is_wrapped, runs_eagerly
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces, given_states
 from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
@@ -90,12 +99,7 @@ class PositionDrive(Drive):
 
     def step(self) -> DriveStep:
         """See `Drive`."""
-        gain, compliance = _number("gain", self.gain), _number("compliance", self.compliance)
-        if bool((compliance < 0).any()):
-            raise InvalidInputError(
-                f"compliance: expected numbers of at least 0, got {float(compliance.min()):g}; a force pushes a disc "
-                f"away, never nearer"
-            )
+        gain, compliance = _number("gain", self.gain), _number("compliance", self.compliance, 0.0)
         return DriveStep(gain.new_ones(1, 1), gain.unsqueeze(-1), compliance.unsqueeze(-1))
 
 
@@ -121,7 +125,7 @@ class PDDrive(Drive):
 
     def step(self) -> DriveStep:
         """See `Drive`."""
-        return self._until(self.substeps)
+        return self._until(check_positive_int("substeps", self.substeps))
 
     def course(self) -> DriveStep:
         """See `Drive`: after each substep."""
@@ -129,7 +133,9 @@ class PDDrive(Drive):
         return DriveStep(*(torch.stack(values) for values in zip(*each, strict=True)))
 
     def _until(self, substeps: int) -> DriveStep:
-        kp, kv, h = _number("stiffness", self.stiffness), _number("damping", self.damping), self.substep
+        kp, kv = _number("stiffness", self.stiffness, 0.0), _number("damping", self.damping, 0.0)
+        kp, kv = torch.broadcast_tensors(kp, kv)
+        h = check_number("substep", self.substep, strict=True)
         one, zero = torch.ones_like(kp), torch.zeros_like(kp)
         # (p, v, target)₊ = M (p, v, target), for one substep.
         M = torch.stack(
@@ -167,8 +173,10 @@ class ForceDrive(Drive):
 
     def step(self) -> DriveStep:
         """See `Drive`."""
-        mass, h = _number("mass", self.mass), self.seconds
-        decay = torch.exp(-_number("damping", self.damping) * h).expand(mass.shape)
+        mass, damping = _number("mass", self.mass, 0.0, True), _number("damping", self.damping, 0.0)
+        mass, damping = torch.broadcast_tensors(mass, damping)
+        h = check_number("seconds", self.seconds, strict=True)
+        decay = torch.exp(-damping * h)
         one, zero = torch.ones_like(mass), torch.zeros_like(mass)
         A = torch.stack([torch.stack([one, h * decay], -1), torch.stack([zero, decay], -1)], -2)
         impulse = torch.stack([h / mass, 1 / mass], -1)
@@ -227,10 +235,9 @@ class PlanarPushing:
     nearest: int | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.shape, Shape):
-            raise DTypeError(f"shape: expected a Shape, got {describe(self.shape)}; give Circle, Polygon or Union")
-        if not isinstance(self.drive, Drive):
-            raise DTypeError(f"drive: expected a Drive, got {describe(self.drive)}; give PositionDrive(), for example")
+        check_kind("shape", self.shape, Shape, "give Circle, Polygon or Union")
+        check_kind("drive", self.drive, Drive, "give PositionDrive(), for example")
+        check_kind("inertia", self.inertia, (Inertia, type(None)))
         check_positive_int("n_discs", self.n_discs)
         if self.nearest is not None:
             check_positive_int("nearest", self.nearest)
@@ -245,7 +252,7 @@ class PlanarPushing:
             got = tuple(values["center_of_mass"].shape)
             raise ShapeError(f"center_of_mass: expected (2,), got {got}; give x and y in coordinates of the body")
         values["gyration"] = _number("gyration", self._default_gyration() if self.gyration is None else self.gyration)
-        if not float(values["gyration"].detach()) > 0:
+        if values["gyration"].numel() != 1 or not float(values["gyration"].detach()) > 0:
             raise InvalidInputError(f"gyration: expected a number above 0, got {self.gyration}; give it as a length")
         length = float(values["gyration"].detach()) if self.length is None else self.length
         values["length"] = check_number("length", length, strict=True)
@@ -302,8 +309,13 @@ class PlanarPushing:
             InvalidInputError and its kinds: no state, or of another size.
         """
         check_tensor("x", x := given_states(x), [("n_x", self.n_x)])
-        if not x.is_cpu:  # computed there, as plans are
-            return self.params(x.cpu(), context).to(x.device)
+        if not x.is_cpu or x.dtype is not torch.float64:  # computed so, as plans are
+            return self.params(x.to("cpu", torch.float64), context).to(x.device, x.dtype)
+        if any(getattr(self, name).requires_grad for name in vars(self)["defaults"] if name != "length"):
+            return self.replace()._params(x)  # they follow a shape that is learned
+        return self._params(x)
+
+    def _params(self, x: Tensor) -> LCSParams:
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
         contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
         if self.inertia is not None:
@@ -325,7 +337,7 @@ class PlanarPushing:
     def _unit_of_force(self) -> float | None:
         if self.inertia is None:
             return None
-        mass = float(_number("mass", self.inertia.mass).detach())
+        mass = float(_number("mass", self.inertia.mass, 0.0, True).detach())
         return (self.length or 1.0) * mass / self.inertia.seconds
 
     def contacts(self, x: Tensor) -> Contacts:
@@ -348,9 +360,8 @@ class PlanarPushing:
         def rows(vx: Tensor, vy: Tensor) -> Tensor:
             """Derivative of (disc − point of the body beside it) along v by the state: (..., m · parts, n_x)."""
             of_body = torch.stack([-vx, -vy, rx * -vy + ry * vx], -1).reshape(*batch, m * parts, 3)
-            of_discs = torch.zeros(*batch, m, parts, m, 2, dtype=x.dtype, device=x.device)
-            each = torch.arange(m)
-            of_discs[..., each, :, each, :] = torch.stack([vx, vy], -1).movedim(-3, 0)
+            own = torch.eye(m, dtype=x.dtype)[:, None, :, None]
+            of_discs = own * torch.stack([vx, vy], -1).unsqueeze(-2)
             rest = x.new_zeros(*batch, m * parts, self.n_x - 3 - 2 * m)
             return torch.cat([of_body, of_discs.reshape(*batch, m * parts, 2 * m), rest], -1)
 
@@ -379,7 +390,9 @@ class PlanarPushing:
         key, (kept_key, kept) = (numbers, like.dtype, like.device), vars(self).get("kept", (None, None))
         if numbers is not None and key == kept_key:
             return kept[0].clone(), kept[1].clone(), kept[2]  # what a caller gets is theirs
-        m, n_x, h = self.n_discs, self.n_x, 0.0 if self.inertia is None else self.inertia.seconds
+        m, n_x, h = self.n_discs, self.n_x, 0.0
+        if self.inertia is not None:
+            h = check_number("seconds", self.inertia.seconds, strict=True)
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
         step, k = self.drive.step(), self.drive.order
@@ -391,7 +404,8 @@ class PlanarPushing:
             B[of[i], torch.arange(2 * m)] = step.b[..., i].to(A).expand(m, 2).reshape(-1)
             response[of[i], places] = step.response[..., i].to(A).expand(m, 2).reshape(-1)
         if self.inertia is not None:
-            decay, speed = torch.exp(-_number("damping", self.inertia.damping).to(A) * h), n_x - 3 + torch.arange(3)
+            decay = torch.exp(-_number("damping", self.inertia.damping, 0.0).to(A) * h)
+            speed = n_x - 3 + torch.arange(3)
             A[torch.arange(3), speed] = h * decay.expand(3)
             A[speed, speed] = decay.expand(3)
         if numbers is not None and not torch.is_inference_mode_enabled():
@@ -400,13 +414,11 @@ class PlanarPushing:
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
         A, B, response = self._without_contact(x)
-        response, mobility = response.expand(*x.shape[:-1], -1, -1).clone(), self._mobility(x)
+        mobility, rest = self._mobility(x), self.n_x - 3
         if self.inertia is None:
-            response[..., :3, :3] = mobility
-            return FreeMotion(A, B, x.new_zeros(self.n_x), response)
+            return FreeMotion(A, B, x.new_zeros(self.n_x), response + pad(mobility, (0, rest, 0, rest)))
         h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
-        response[..., :3, :3] = h * mobility / mass
-        response[..., -3:, :3] = mobility / mass
+        response = response + pad(h * mobility / mass, (0, rest, 0, rest)) + pad(mobility / mass, (0, rest, rest, 0))
         return FreeMotion(A, B, self._turning(x, A[-1, -1], h), response)
 
     def _turning(self, x: Tensor, decay: Tensor, h: float) -> Tensor:
@@ -458,11 +470,14 @@ def to_body(x: Tensor, points: Tensor) -> Tensor:
     return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
 
 
-def _number(name: str, value: Any) -> Tensor:
-    """Convert a number to a finite float64 tensor; a tensor is returned as it is."""
+def _number(name: str, value: Any, least: float = -math.inf, strict: bool = False) -> Tensor:
+    """Convert a number of at least (`strict`: above) `least` to a finite float64 tensor; a tensor is not converted."""
     if not isinstance(value, Tensor):
-        try:
-            value = torch.tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise DTypeError(f"{name}: expected a number or a tensor, got {describe(value)}; {error}") from error
-    return check_tensor(name, value)
+        value = torch.from_numpy(check_array(name, value).copy())
+    check_tensor(name, value)
+    if least > -math.inf and not is_wrapped(value) and bool(((value <= least) if strict else (value < least)).any()):
+        raise InvalidInputError(
+            f"{name}: expected numbers {'above' if strict else 'of at least'} {least:g}, got {float(value.min()):g}; "
+            f"change it"
+        )
+    return value

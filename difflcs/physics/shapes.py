@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_tensor, describe
+from difflcs._checks import check_array, check_kind, check_number, check_tensor, describe
 from difflcs._differentiation import transforms_active
 from difflcs._recall import Recall
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import InvalidInputError, ShapeError
 
 _ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
 
@@ -252,8 +252,7 @@ class Union(Shape):
     def __post_init__(self) -> None:
         parts = []
         for part in self.parts:
-            if not isinstance(part, Shape):
-                raise DTypeError(f"parts: expected shapes, got {describe(part)}; give Circle, Polygon or Union")
+            check_kind("parts", part, Shape, "give Circle, Polygon or Union")
             parts += part.parts if isinstance(part, Union) else [part]
         if not parts:
             raise InvalidInputError("parts: expected at least one shape, got none; give Circle or Polygon")
@@ -287,6 +286,8 @@ class Union(Shape):
 
 def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
     """Make a rectangle along the axes of its body."""
+    for name, value in (("x_min", x_min), ("x_max", x_max), ("y_min", y_min), ("y_max", y_max)):
+        check_number(name, value, -math.inf)
     if not (x_min < x_max and y_min < y_max):
         raise InvalidInputError(
             f"box: expected x_min < x_max and y_min < y_max, got {(x_min, x_max, y_min, y_max)}; exchange them"
@@ -297,10 +298,7 @@ def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
 def _tensor(name: str, value: Any | Sequence) -> Tensor:
     """Convert numbers to float64; copy a tensor, or return it if it requires a gradient."""
     if not isinstance(value, Tensor):
-        try:
-            value = torch.tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError) as error:
-            raise DTypeError(f"{name}: expected numbers or a tensor, got {describe(value)}; {error}") from error
+        value = torch.from_numpy(check_array(name, value))
     return check_tensor(name, value if value.requires_grad else value.clone())
 
 

@@ -64,7 +64,7 @@ class BodyPlaces:
         self._model, self._data, self._axis = model, mujoco.MjData(model), module._finder.axis
         frames = self._cost._scene.frames
         carriers = [i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i]) for kind, i in frames]
-        self._body = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_BODY), body)
+        self._body = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_BODY), str(body))
         of, pairs = model.geom_bodyid, np.stack(module._finder.pairs, -1)
         pairs = np.concatenate([pairs, pairs[:, ::-1]])
         self._pairs = [pairs[(of[pairs] == [tip, self._body]).all(-1)] for tip in carriers]

@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_tensor
+from difflcs._checks import check_kind, check_number, check_tensor
 from difflcs.constraints import LinearConstraints
 from difflcs.errors import ShapeError
 from difflcs.physics.planar import to_body
@@ -45,7 +45,7 @@ class Obstacles:
     def __init__(self, body: Shape, radius: float, *, margin: float | None = None, price: float = 100.0):
         self.radius, self.price = check_number("radius", radius, strict=True), check_number("price", price, strict=True)
         self.margin = radius / 3 if margin is None else check_number("margin", margin, strict=True)
-        self._outline = ring(body, self.margin, _OUTLINE)
+        self._outline = ring(check_kind("body", body, Shape), self.margin, _OUTLINE)
         axis = torch.arange(-body.radius, body.radius, radius, dtype=torch.float64)
         points = torch.cartesian_prod(axis, axis)
         self._inside = points[body.contains(points)]

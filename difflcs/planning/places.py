@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_tensor, make_plain
+from difflcs._checks import check_array, check_kind, check_number, check_tensor, describe, make_plain
 from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
@@ -57,8 +57,8 @@ class Workspace:
         make_plain(self)
         check_number("step", self.step, strict=True)
         for name in ("low", "high"):
-            if len(getattr(self, name)) != 2:
-                raise ShapeError(f"{name}: expected x and y, got {len(getattr(self, name))} numbers; give a corner")
+            if check_array(name, getattr(self, name)).shape != (2,):
+                raise ShapeError(f"{name}: expected x and y, got {describe(getattr(self, name))}; give a corner")
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise InvalidInputError(
                 f"low: expected less than high in x and y, got {tuple(self.low)} and {tuple(self.high)}; exchange them"
@@ -122,10 +122,12 @@ class DiscPlaces:
         margin: float = 0.0,
         obstacles: Obstacles | None = None,
     ):
-        self.shape, self.obstacles = shape, obstacles
+        self.shape = check_kind("shape", shape, Shape)
+        self.obstacles = check_kind("obstacles", obstacles, (Obstacles, type(None)))
         self.radius = check_number("radius", radius, strict=True)
         self.reach = radius if reach is None else check_number("reach", reach)
-        self.workspace, self.margin = workspace, check_number("margin", margin)
+        self.workspace = check_kind("workspace", workspace, (Workspace, type(None)))
+        self.margin = check_number("margin", margin)
         self.gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
         self.ring = ring(shape, radius + self.gap, n_places)
 

@@ -28,9 +28,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor, describe, make_plain
+from difflcs._checks import check_kind, check_number, check_positive_int, check_tensor, make_plain
 from difflcs.constraints import LinearConstraints
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError, SolveWarning
+from difflcs.errors import InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
 from difflcs.planning.places import Places
@@ -151,8 +151,7 @@ class SamplingPolicy:
         angles: Sequence[int] = (),
         constraints: Rows | None = None,
     ):
-        if not isinstance(mpc, LCSMPCLayer):
-            raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; build one around your LCSModule")
+        check_kind("mpc", mpc, LCSMPCLayer, "build one around your LCSModule")
         if mpc.on_failure != "mask":
             raise InvalidInputError(
                 'mpc: expected a layer with on_failure="mask", got "raise"; one place without a solution must not stop '

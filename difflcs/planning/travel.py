@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number
+from difflcs._checks import check_kind, check_number
 from difflcs.physics.planar import Drive, PositionDrive, to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.obstacles import Obstacles
@@ -75,14 +75,14 @@ class PlanarTravel:
         workspace: Workspace | None = None,
         obstacles: Obstacles | None = None,
     ):
-        self.shape = shape
+        self.shape = check_kind("shape", shape, Shape)
         self.radius = check_number("radius", radius, strict=True)
         self.step = check_number("step", step, strict=True)
         self.clearance = 0.5 * radius if clearance is None else check_number("clearance", clearance, strict=True)
         self.tolerance = 0.5 * radius if tolerance is None else check_number("tolerance", tolerance, strict=True)
-        self.workspace, self.obstacles = workspace, None
+        self.workspace, self.obstacles = check_kind("workspace", workspace, (Workspace, type(None))), None
         with torch.no_grad():
-            course = (PositionDrive() if drive is None else drive).course()
+            course = check_kind("drive", PositionDrive() if drive is None else drive, Drive).course()
             instants, order = len(course.b), course.b.shape[-1]
             self._A = course.A.reshape(instants, -1, order, order).expand(-1, 2, -1, -1)  # by coordinate
             self._b = course.b.reshape(instants, -1, order).expand(-1, 2, -1)
@@ -90,7 +90,7 @@ class PlanarTravel:
             self.ring, x = ring(shape, radius + self.clearance, _WAYPOINTS), torch.zeros(3, dtype=torch.float64)
             seen = torch.stack([self._in_sight(x, point, self.ring) for point in self.ring])
             self._between = torch.where(seen & seen.mT, torch.cdist(self.ring, self.ring), math.inf)
-        self.obstacles = obstacles
+        self.obstacles = check_kind("obstacles", obstacles, (Obstacles, type(None)))
         self._surveyed: tuple[Tensor, Tensor, Tensor] | None = None
 
     def distance(self, x: Tensor, states: Tensor) -> Tensor:

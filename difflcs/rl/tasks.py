@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, did_you_mean, make_plain
+from difflcs._checks import check_kind, check_number, check_positive_int, did_you_mean, make_plain
 from difflcs._optional import require
 from difflcs.cost import CostModule, GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
@@ -198,11 +198,7 @@ class TaskSpec:
             value = getattr(self, name)
             if not callable(value) and not (name == "env" and isinstance(value, str)):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
-        if self.physics is not None and not isinstance(self.physics, PhysicsSpec):
-            raise DTypeError(
-                f"physics: expected a PhysicsSpec or None, got {type(self.physics).__name__}; wrap what makes the "
-                f"system in one"
-            )
+        check_kind("physics", self.physics, (PhysicsSpec, type(None)), "wrap what makes the system in one")
         low, high = self.bounds
         if not bool((low < high).all()):
             raise InvalidInputError(f"u_min: expected u_min < u_max, got {self.u_min} and {self.u_max}; swap them")
@@ -376,8 +372,7 @@ def register_task(spec: TaskSpec) -> TaskSpec:
     Raises:
         DTypeError: not a `TaskSpec`.
     """
-    if not isinstance(spec, TaskSpec):
-        raise DTypeError(f"spec: expected a TaskSpec, got {type(spec).__name__}")
+    check_kind("spec", spec, TaskSpec)
     _REGISTRY[spec.name] = spec
     return spec
 

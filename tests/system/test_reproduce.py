@@ -379,17 +379,6 @@ def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatc
     assert job.result() is None
 
 
-def test_ctrl_c_says_how_to_go_on(monkeypatch, tmp_path, capsys):
-    def interrupt(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(runs, "compute", interrupt)
-    monkeypatch.setattr(runs, "connect", lambda *arguments: contextlib.nullcontext())
-    code, _, err = run_script(run_runs, capsys, "--methods", "pddm", "--work", tmp_path, "--results", tmp_path)
-    assert code == 130
-    assert "the same command goes on" in err
-
-
 def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runs, "connect", lambda workers: contextlib.nullcontext(local))
     options = ["--rerun", "--preset", "smoke", "--objects", "mug", "--methods", "violation"]
@@ -475,17 +464,6 @@ def results(tmp_path):
     return tmp_path
 
 
-def test_differences_are_of_whole_goals(tmp_path):
-    """With shares of six decimals equal differences would not be equal, and p too small: here the mean is zero."""
-    for seed, reached in enumerate((97, 101, 101, 101)):
-        for unit, share in ((Unit("mug", "lcs-rl", "ours", seed), reached), (Unit("mug", "ppo", "ours", seed), 100)):
-            percent = 100 * round(share / 300, 6)
-            records.add(tmp_path, "paper", unit_rows(unit, (0, 0, 0, percent), goals=300))
-    rows = records.read(records.path_of(tmp_path, "paper"))
-    pair = [records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "ppo")]
-    assert stats.p_value(report.paired(*pair, "final")) == 1.0
-
-
 def test_stand_ins_are_a_table_of_their_own(results, capsys):
     before = records.path_of(results, "paper").read_bytes()
     unit = Unit("banana", "lcs-rl", "ours", FIRST)
@@ -536,17 +514,6 @@ def test_only_what_can_be_compared_is(results):
         assert report.paired(a, other, "final") == []
     assert report.paired(a, records.select(rows, "cube", "violation", "ours"), "final") == []
     assert report.paired(a, None, "final") == []
-
-
-def test_readme_is_filled_between_its_marks_only(tmp_path):
-    readme = tmp_path / "README.md"
-    readme.write_text("before\n<!-- results: table1 -->\nold\n<!-- end -->\nafter\n")
-    report.update_readme("table1", "new\n", readme)
-    report.update_readme("table1-quick", "quick\n", readme)
-    assert readme.read_text() == "before\n<!-- results: table1 -->\n\nnew\n\n<!-- end -->\nafter\n"
-    readme.write_text("<!-- results: table1 -->\nold\n")
-    with pytest.raises(CheckpointError, match="put it back"):
-        report.update_readme("table1", "new\n", readme)
 
 
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):

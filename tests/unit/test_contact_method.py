@@ -71,7 +71,7 @@ def test_a_description_of_physics_is_checked():
     ):
         with pytest.raises(error, match=next(iter(wrong))):
             PhysicsSpec(**{"make_system": lambda: None, "scale": (1.0,), **wrong})
-    with pytest.raises(DTypeError, match="physics: expected a PhysicsSpec"):
+    with pytest.raises(DTypeError, match="physics: expected PhysicsSpec"):
         make_task(physics=ContactLCS)
 
 

@@ -233,8 +233,11 @@ def test_a_module_whose_system_changes_its_form_or_breaks_is_refused(build, chan
     elif change == "size":
         other = build.params(0, n_lam=2)
     else:
-        (other.A if change == "NaN" else other.F)[0, 0] = np.nan if change == "NaN" else -1.0
+        (other.A if change == "NaN" else other.F).numpy()[0, 0] = np.nan if change == "NaN" else -1.0
     mpc.lcs.params = lambda x, context: other
+    if change in ("F in place", "NaN"):
+        with pytest.raises(InvalidInputError, match=r"F \+ Fᵀ pos|A: expected finite"):
+            mpc.controller().step(x)
     with pytest.raises(InvalidInputError, match=r"expected (. \(.*as in the first|F \+ Fᵀ pos|finite).*; "):
         controller.step(x)
     mpc.lcs.params = plain

@@ -86,8 +86,22 @@ def test_a_log_and_its_episodes_are_the_same_transitions():
         (lambda d: Transitions.from_episodes(np.ones((3, 2)), np.ones((3, 1)), [0, 0]), ShapeError, "one number"),
         (lambda d: Transitions(*(v[:3] for v in d)).split(), InvalidInputError, "at least two episodes"),
         (lambda d: fit_report(cart_pole_between_walls(), d.x, d.u[1:], d.x_next), ShapeError, "same N"),
-        (lambda d: fit_report(cart_pole_between_walls(), d.x.float(), d.u, d.x_next), DTypeError, "u: expected"),
+        (lambda d: fit_report(cart_pole_between_walls(), d.x, d.u.float(), d.x_next), DTypeError, "u: expected"),
         (lambda d: fit_report(cart_pole_between_walls(), *d, horizon=0), InvalidInputError, "horizon"),
+        (lambda d: Transitions.from_episodes([d.x, d.x], [d.u[1:]]), ShapeError, "actions: expected 2 episodes"),
+        (lambda d: Transitions.from_episodes([d.x, d.u], [d.u[1:], d.u[1:]]), ShapeError, r"states\[1\]: .*n=4"),
+        (lambda d: Transitions.from_episodes([["a"], ["b"]], [[1.0]]), DTypeError, "states: expected real numbers"),
+        (lambda d: Transitions.from_episodes([[[1.0, 2.0], [1.0]]], [[[1.0]]]), DTypeError, "states: expected numbers"),
+        (lambda d: d.split(seed=-1), InvalidInputError, "seed: expected at least 0"),
+        (lambda d: fit_report("cart pole", *d), DTypeError, "lcs: expected an LCSModel"),
+        (lambda d: fit_report(LCSModel(4, 1, 2, dtype=torch.float32), *d), DTypeError, "float32 like the system"),
+        (lambda d: fit_report(cart_pole_between_walls(), *d, train=d[:2]), InvalidInputError, "train: expected x, u"),
+        (lambda d: fit_report(cart_pole_between_walls(), *d, train=(d.x, d.u[1:], d.x)), ShapeError, "train u: .*N="),
+        (
+            lambda d: fit_report(cart_pole_between_walls(), *d, train=(d.x, d.u * np.nan, d.x)),
+            NonFiniteError,
+            "train u",
+        ),
     ],
 )
 def test_bad_input(call, error, message):

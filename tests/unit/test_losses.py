@@ -340,7 +340,7 @@ def test_what_is_no_system_is_refused(build, each, data, function):
             function(value, *data)
     module = Moving(build)
     module.params = lambda x=None, context=None: sequence
-    with pytest.raises(DTypeError, match=r"Moving.params: expected LCSParams for transitions.*got LCSSequence; give"):
+    with pytest.raises(DTypeError, match=r"Moving.params: expected LCSParams, got LCSSequence.*; transitions"):
         function(module, *data)
     with pytest.raises(InvalidInputError, match=r"context: expected None beside LCSParams.*; leave it out"):
         function(each, *data, context=data[0])

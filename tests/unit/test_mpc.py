@@ -301,7 +301,7 @@ FITS_NOT_A_CALL = [
     (lambda b: {"constraints": LinearConstraints(ones(2, 4), ones(5, 2))}, ShapeError,
      r"batch dimensions .* do not fit.*x0 \(6,\)"),
     (lambda b: {"lcs": SimpleNamespace(n_x=4, n_u=2, n_lam=3, params=lambda x, context: {})}, DTypeError,
-     "lcs: expected LCSParams or LCSSequence from SimpleNamespace.params, got dict.*; return"),
+     "lcs: expected LCSParams or LCSSequence, got dict.*; return one of them from SimpleNamespace.params"),
     (lambda b: {"context": ones(2)}, ShapeError, "context: expected none with LCSParams, .*; pass lcs="),
     (lambda b: {"goal": ones(4)}, ShapeError, "goal: expected none with a QuadraticCost"),
     (lambda b: {"reference": ones(4, 4)}, ShapeError, "reference: expected none with a QuadraticCost"),

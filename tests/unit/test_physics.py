@@ -116,9 +116,10 @@ BAD_SHAPES = [
     (lambda: Polygon([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), InvalidInputError, "vertices: expected"),
     (lambda: Polygon("a square"), DTypeError, "vertices: expected"),
     (lambda: Circle(0.0), InvalidInputError, "r: expected"),
-    (lambda: Union(("circle",)), DTypeError, "parts: expected shapes"),
+    (lambda: Union(("circle",)), DTypeError, "parts: expected Shape"),
     (lambda: Union(()), InvalidInputError, "at least one shape"),
     (lambda: box(1, 0, 0, 1), InvalidInputError, "x_min < x_max"),
+    (lambda: box("1", 2, 0, 1), DTypeError, "x_min: expected a number"),
 ]
 
 
@@ -349,6 +350,30 @@ def test_what_inference_mode_prepares_is_not_kept():
     assert x.grad is not None
 
 
+def test_the_physics_follows_a_shape_that_is_learned_as_often_as_gradients_are_taken():
+    corners = tensor([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.08]]).requires_grad_()
+    system, x = PlanarPushing(Polygon(corners), 0.01, friction=0.3), tensor([0.0, 0.0, 0.2, -0.1, 0.01])
+    for _ in range(2):
+        system.params(x).C.square().sum().backward()
+        with torch.no_grad():
+            corners.mul_(1.1)
+        fresh = PlanarPushing(Polygon(corners.detach()), 0.01, friction=0.3).params(x).tensors()
+        torch.testing.assert_close({k: v.detach() for k, v in system.params(x).tensors().items()}, fresh)
+
+
+@pytest.mark.parametrize("drive", [PositionDrive(), PDDrive([100.0, 50.0], 20.0, 0.01, 5), ForceDrive(1.0, 0.1, 0.5)])
+@pytest.mark.parametrize("inertia", [None, Inertia(1.0, 0.1)])
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+def test_states_of_single_precision_and_those_that_are_mapped(drive, inertia):
+    system = pushing(n_discs=2, friction=0.4, drive=drive, inertia=inertia)
+    x = 0.1 * torch.randn(3, system.n_x, dtype=F64, generator=torch.Generator().manual_seed(0))
+    for name, value in system.params(x).tensors().items():
+        mapped = torch.vmap(lambda x: getattr(system.params(x), name))(x)  # noqa: B023
+        torch.testing.assert_close(mapped, value.expand_as(mapped))
+        single = getattr(system.params(x.float()), name)
+        torch.testing.assert_close(single, value.float(), rtol=1e-3, atol=1e-4)
+
+
 def test_another_shape_has_its_own_centre_and_gyration():
     small, large = box(-0.05, 0.05, -0.05, 0.05), box(0.0, 0.2, 0.0, 0.2)
     system, fresh = PlanarPushing(small, 0.01).replace(shape=large), PlanarPushing(large, 0.01)
@@ -498,18 +523,25 @@ def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_g
     [({"radius": tensor([0.1, 0.1, 0.1])}, ShapeError, "radius: expected a number or"),
      ({"gyration": 0.0}, InvalidInputError, "gyration: expected"),
      ({"center_of_mass": (0.0,)}, ShapeError, "center_of_mass"),
-     ({"drive": "fast"}, DTypeError, "drive: expected a Drive"),
+     ({"drive": "fast"}, DTypeError, "drive: expected Drive"),
      ({"cone": "flat"}, InvalidInputError, "cone: expected"),
      ({"friction": "much"}, DTypeError, "friction: expected a number"),
      ({"nearest": 0}, InvalidInputError, "nearest"),
+     ({"inertia": "heavy"}, DTypeError, "inertia: expected Inertia"),
+     ({"inertia": Inertia(-1.0, 0.1)}, InvalidInputError, "mass: expected numbers above 0, got -1"),
+     ({"inertia": Inertia(1.0, 0)}, InvalidInputError, "seconds: expected a finite number above 0"),
+     ({"drive": ForceDrive(0.0, 0.1)}, InvalidInputError, "mass: expected numbers above 0"),
+     ({"drive": PDDrive(1.0, -2.0, 0.1, 3)}, InvalidInputError, "damping: expected numbers of at least 0"),
+     ({"drive": PDDrive(1.0, 2.0, 0.1, -3)}, InvalidInputError, "substeps: expected at least 1"),
+     ({"drive": PDDrive(1.0, 2.0, -0.1, 3)}, InvalidInputError, "substep: expected a finite number above 0"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(wrong, error, match):
     with pytest.raises(error, match=match):
-        pushing(**wrong)
+        (system := pushing(**wrong)).params(torch.zeros(system.n_x, dtype=F64))
     with pytest.raises(InvalidInputError, match="x: expected states"):
         pushing().params()
-    with pytest.raises(DTypeError, match="shape: expected a Shape"):
+    with pytest.raises(DTypeError, match="shape: expected Shape"):
         PlanarPushing("box", 0.01)
     with pytest.raises(InvalidInputError, match="compliance: expected numbers of at least 0"):
         pushing(drive=PositionDrive(1.0, -0.1)).params(torch.zeros(5, dtype=F64))

@@ -481,6 +481,10 @@ REFUSED = [  # calls, errors, and what these say
     (lambda: MujocoLCS(PUSHING).params(torch.zeros(4).double()), ShapeError, "n_x=5"),
     (lambda: MujocoLCS(PUSHING).params(tensor(0, 0, 0, 0, np.nan)), NonFiniteError, "NaN"),
     (lambda: MujocoState(PUSHING).to_state([1.0]), ShapeError, "qpos"),
+    (lambda: MujocoState(PUSHING).to_state(["a"] * 5), DTypeError, "qpos: expected real numbers"),
+    (lambda: MujocoLCS(PUSHING, mobility=[[1.0], []]), DTypeError, "mobility: expected numbers"),
+    (lambda: MujocoLCS(PUSHING, motion="dynamic", ctrl="0"), DTypeError, "ctrl: expected real numbers"),
+    (lambda: MujocoLCS(PUSHING, motion=np.array(["dynamic", "dynamic"])), InvalidInputError, "motion: expected one"),
     (lambda: MujocoLCS(pushing('<actuator><motor joint="px"/></actuator>')).control(tensor(*[0] * 5), tensor(0)),
      InvalidInputError, "position actuators"),
 ]  # fmt: skip

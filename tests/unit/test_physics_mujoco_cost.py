@@ -204,5 +204,5 @@ def test_calls_that_do_not_fit_say_why():
         InvalidInputError, match=r'Velocity: expected a module whose state has velocities \(motion="dyn'
     ):
         make([Velocity()], dynamic=False)
-    with pytest.raises(DTypeError, match="module: expected a MujocoLCS"):
+    with pytest.raises(DTypeError, match="module: expected MujocoLCS"):
         MujocoCost(mujoco.MjModel.from_xml_string(MODEL), [])

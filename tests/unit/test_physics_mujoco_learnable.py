@@ -137,6 +137,7 @@ def test_it_counts_rotations_from_where_things_are():
         ("mass", "expected kinds or pairs"),
         ([], "expected kinds or pairs"),
         (["mass", ("mass", "*")], "each once"),
+        ([("mass", None)], "expected kinds or pairs"),  # MuJoCo ends the process where it is asked for such a name
         (["masses"], "did you mean"),
         ([("mass", "sphere")], "name of a body with a mass"),
         ([("size", "floor")], "name of a geom with a size"),

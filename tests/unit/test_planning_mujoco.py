@@ -52,3 +52,5 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
     assert travel.arrived(x, target)
     with pytest.raises(InvalidInputError, match="effectors: expected"):
         BodyPlaces(module, "box", ["box"])
+    with pytest.raises(InvalidInputError, match="may touch the body None"):
+        BodyPlaces(module, None, ["tip"])

@@ -1,5 +1,7 @@
 """Units suggested from data: the same whatever the units of the data, and a model learns as well in any."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -79,7 +81,7 @@ def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_
     assert (read.scales.xi, read.scales.relaxation) == (scaled.scales.xi, scaled.scales.relaxation)
     with pytest.raises(CheckpointError, match="ScaledLCS"):
         LCSModel.from_pretrained(tmp_path / "it")
-    with pytest.raises(DTypeError, match="LCSModel within"):
+    with pytest.raises(DTypeError, match="lcs: expected LCSModel"):
         ScaledLCS(scaled, scaled.scales).save_pretrained(tmp_path / "other")
 
 
@@ -136,3 +138,20 @@ def test_systems_and_data_of_other_sizes_are_refused(build, data):
         scales.normalise(data[0], data[0], data[2])
     with pytest.raises(ShapeError, match=r"x_next: expected shape \(\.\.\., n_x=4\), got \(200, 2\)"):
         scales.normalise(*data[:2], data[1])
+    assert torch.equal(replace(scales, state=scales.state.numpy()).states(data[0]), scales.states(data[0]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "match"),
+    [
+        (lambda s: replace(s, state=-s.state), InvalidInputError, "state: expected units above 0"),
+        (lambda s: replace(s, center=s.center[1:]), ShapeError, "state: expected a number for each"),
+        (lambda s: replace(s, xi="0.1"), DTypeError, "xi: expected a number"),
+        (lambda s: s.params(s), DTypeError, "params: expected LCSParams"),
+        (lambda s: ScaledLCS(s, s), DTypeError, "lcs: expected LCSModule"),
+        (lambda s: LCSModel.from_params(None), DTypeError, "params: expected LCSParams"),
+    ],
+)
+def test_what_is_not_meant_is_refused(data, wrong, error, match):
+    with pytest.raises(error, match=match):
+        wrong(suggest_scales(*data))

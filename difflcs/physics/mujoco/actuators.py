@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs._checks import broadcast_batch, check_kind, check_tensor
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
@@ -214,10 +214,8 @@ def disabled_actuators(model: Any) -> NDArray[np.bool_]:
 
 def check_model(model: Any, data: Any, motion: str) -> None:
     """Check that a model and its data are such as a motion has."""
-    if not isinstance(model, mujoco.MjModel):
-        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
-    if data is not None and not isinstance(data, mujoco.MjData):
-        raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
+    check_kind("model", model, mujoco.MjModel, "load one with MjModel")
+    check_kind("data", data, (mujoco.MjData, type(None)), "pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
     dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)

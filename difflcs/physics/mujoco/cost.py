@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_number, check_tensor, describe, did_you_mean
+from difflcs._checks import broadcast_batch, check_array, check_kind, check_number, check_tensor, describe, did_you_mean
 from difflcs._fields import TensorFields
 from difflcs.cost import QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
@@ -150,8 +150,7 @@ class MujocoCost(TensorFields):
 
     def __init__(self, module: MujocoLCS, terms: Sequence[Term]):
         super().__init__()
-        if not isinstance(module, MujocoLCS):
-            raise DTypeError(f"module: expected a MujocoLCS, got {describe(module)}; pass the one of the system")
+        check_kind("module", module, MujocoLCS, "pass the one of the system")
         if not isinstance(terms, Sequence) or not terms:
             raise DTypeError(
                 f"terms: expected a list of Position, Orientation, …, got {describe(terms)}; give one at least"
@@ -296,7 +295,7 @@ def _weight(name: str, value: Weight | None, size: int) -> Any:
     """A weight: a tensor as it is, anything else as an array."""
     if value is None:
         return None
-    weight: Any = value if isinstance(value, Tensor) else np.array(value, dtype=np.float64)
+    weight: Any = value if isinstance(value, Tensor) else check_array(name, value)
     check_tensor(name, torch.as_tensor(weight))
     if weight.shape not in ((), (size,)):
         raise ShapeError(f"{name}: expected one number or {size} of them, got {describe(weight)}; see the term")
@@ -333,7 +332,7 @@ class _Row(NamedTuple):
         """The same with its goal as an array."""
         if self.goal is None:
             return self
-        goal = np.array(self.goal, dtype=np.float64)
+        goal = check_array(f"{self.about}: goal", self.goal).copy()
         if goal.shape != (self.n_goal,):
             raise ShapeError(f"{self.about}: expected a goal of shape ({self.n_goal},), got {goal.shape}; see the term")
         if not np.isfinite(goal).all():

@@ -12,8 +12,15 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
+from difflcs._checks import (
+    check_array,
+    check_choice,
+    check_kind,
+    check_number,
+    check_positive_int,
+    check_tensor,
+)
+from difflcs.errors import InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
     Bounded,
     Cone,
@@ -141,13 +148,15 @@ class MujocoLCS:
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
-        mobility = mobility if isinstance(mobility, str) else np.array(mobility)
+        mobility = mobility if isinstance(mobility, str) else check_array("mobility", mobility).copy()
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
             kind = Dynamic if motion == "dynamic" else QuasiDynamic
             self._motion = kind(model, self._actuators, self.seconds, relative)
-        nominal = self._data.ctrl if ctrl is None else self._actuators.nominal(torch.as_tensor(ctrl), torch.Size())
+        nominal = self._data.ctrl
+        if ctrl is not None:
+            nominal = self._actuators.nominal(torch.from_numpy(check_array("ctrl", ctrl)), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
@@ -157,7 +166,10 @@ class MujocoLCS:
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
-        self._places, frictions = Places(model, self._data), (friction, torsion)
+        self._places, frictions = (
+            Places(model, self._data),
+            (None if friction is None else float(friction), bool(torsion)),
+        )
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
@@ -200,8 +212,7 @@ class MujocoLCS:
         Raises:
             DTypeError, ShapeError, NonFiniteError: no such data.
         """
-        if not isinstance(data, mujoco.MjData):
-            raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; for arrays use state.follow")
+        check_kind("data", data, mujoco.MjData, "for arrays use state.follow")
         _take(self._data, data)
         self.state.follow(data.qpos)
         return self.state.to_state(data.qpos, data.qvel, data.act)
@@ -451,8 +462,7 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
     """
-    if data is None:
-        raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
+    check_kind("data", data, mujoco.MjData, "pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 

@@ -111,8 +111,9 @@ class LearnableMujocoLCS(nn.Module):
         if self._options.get("contacts") is None:  # the first has warned if these are too few
             self._options["contacts"] = first.n_contacts or None
         self._entries: list[_Entry] = []
-        pairs = [(one, "*") if isinstance(one, str) else tuple(one) for one in learn]
-        if not pairs or len(set(pairs)) < len(pairs) or isinstance(learn, str):
+        pairs = [(one, "*") if isinstance(one, str) else one for one in learn] if isinstance(learn, Sequence) else []
+        known = all(isinstance(one, Sequence) and [*map(type, one)] == [str, str] for one in pairs)
+        if not (pairs and known) or len(set(map(tuple, pairs))) < len(pairs) or isinstance(learn, str):
             raise InvalidInputError(
                 f"learn: expected kinds or pairs (kind, name), each once, got {learn!r:.200}; name what is uncertain"
             )

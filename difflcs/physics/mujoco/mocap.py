@@ -5,8 +5,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from difflcs._checks import describe
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs._checks import check_kind
+from difflcs.errors import InvalidInputError
 
 _HEAVIER = 1e3  # than all that may pull or push
 
@@ -32,9 +32,7 @@ def drive_mocap(spec: Any) -> Any:
         DTypeError: no `MjSpec`.
         InvalidInputError: it has no mocap bodies.
     """
-    if not isinstance(spec, mujoco.MjSpec):
-        raise DTypeError(f"spec: expected a mujoco.MjSpec, got {describe(spec)}; make one with MjSpec.from_file")
-    spec = spec.copy()
+    spec = check_kind("spec", spec, mujoco.MjSpec, "make one with MjSpec.from_file").copy()
     for i, body in enumerate(spec.bodies[1:]):
         body.name = body.name or f"body_{i + 1}"
     model = spec.compile()

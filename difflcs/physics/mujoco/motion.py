@@ -85,7 +85,7 @@ class QuasiStatic:
             fixed = np.zeros(nv)
             fixed[self.pushed] = 1 / damping
         else:
-            fixed = np.asarray(mobility, dtype=np.float64)
+            fixed = mobility
         fixed = np.diag(fixed) if fixed.ndim == 1 else fixed
         if fixed.shape != (nv, nv) or not np.isfinite(fixed).all():
             raise InvalidInputError(

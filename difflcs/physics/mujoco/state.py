@@ -13,8 +13,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs._checks import check_array, check_kind, check_tensor
+from difflcs.errors import InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.mujoco.native import check_readable
 
 Array = NDArray[np.float64]
@@ -48,10 +48,7 @@ class MujocoState:
     """
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
-        if not isinstance(model, mujoco.MjModel):
-            raise DTypeError(
-                f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
-            )
+        check_kind("model", model, mujoco.MjModel, "load one, MjModel.from_xml_path")
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
         self.na = int(model.na) if velocities else 0
         names: list[str] = []
@@ -200,7 +197,7 @@ class MujocoState:
 
     @staticmethod
     def _array(name: str, value: ArrayLike, size: int) -> Array:
-        array = np.asarray(value, dtype=np.float64)
+        array = check_array(name, value)
         if array.ndim == 0 or array.shape[-1] != size:
             raise ShapeError(f"{name}: expected shape (..., {size}), got {array.shape}; take it from this model's data")
         if not np.isfinite(array).all():

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 from torch.func import functional_call
 
-from difflcs._checks import check_choice, check_number, check_tensor, describe
+from difflcs._checks import check_choice, check_kind, check_number, check_tensor
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs._optional import INSTALL
-from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.errors import InvalidInputError, MissingDependencyError
 from difflcs.lcs import is_plain
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
@@ -225,8 +225,7 @@ class LCSMPCPolicy(GaussianPolicy):
         covariance: str = "fixed",
         in_keys: Sequence[str] = ("state", "goal"),
     ):
-        if not isinstance(mpc, LCSMPCLayer):
-            raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}")
+        check_kind("mpc", mpc, LCSMPCLayer)
         n_u = mpc.lcs.n_u
         if isinstance(in_keys, str) or len(in_keys) != 2:
             raise InvalidInputError(f"in_keys: expected two keys, of state and goal, got {in_keys!r}")
