@@ -77,13 +77,6 @@ def test_every_form_and_size_is_solved(problems, chunks):
     assert total.solved_share >= 0.75  # of the others some cannot be solved
 
 
-def test_a_chunk_depends_on_class_seed_and_number_alone():
-    cell = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched")
-    (a, _), (b, _), (c, _) = cell.chunk(3, 5), cell.chunk(3, 5), cell.chunk(3, 6)
-    assert all((a.arrays[k] == b.arrays[k]).all() for k in a.arrays)
-    assert a.arrays["x0"].shape != c.arrays["x0"].shape or (a.arrays["x0"] != c.arrays["x0"]).any()
-
-
 def test_elements_whose_sweep_must_exchange_rows_change_no_gradient_of_others(monkeypatch):
     """At a nearly skew F the sweep of the gradients is done a second time, of these elements alone."""
     problem, rng = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched").chunk(0, 0)
