@@ -129,7 +129,7 @@ class MujocoLCS:
         limits: int | None = None,
     ):
         options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
-        _check_options(motion, cone, mobility, friction)
+        friction, torsion = _check_options(motion, cone, mobility, friction, torsion)
         check_model(model, data, motion)
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
@@ -154,9 +154,8 @@ class MujocoLCS:
         else:
             kind = Dynamic if motion == "dynamic" else QuasiDynamic
             self._motion = kind(model, self._actuators, self.seconds, relative)
-        nominal = self._data.ctrl
-        if ctrl is not None:
-            nominal = self._actuators.nominal(torch.from_numpy(check_array("ctrl", ctrl)), torch.Size())
+        held = torch.from_numpy(check_array("ctrl", self._data.ctrl if ctrl is None else ctrl))
+        nominal = self._actuators.nominal(held, torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
@@ -166,10 +165,7 @@ class MujocoLCS:
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
-        self._places, frictions = (
-            Places(model, self._data),
-            (None if friction is None else float(friction), bool(torsion)),
-        )
+        self._places, frictions = Places(model, self._data), (friction, torsion)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
@@ -467,13 +463,14 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
-def _check_options(motion: Motion, cone: Cone, mobility: Any, friction: float | None) -> None:
+def _check_options(motion: Any, cone: Any, mobility: Any, friction: Any, torsion: Any) -> tuple[float | None, bool]:
     check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
     check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
     if isinstance(mobility, str):
         check_choice("mobility", mobility, ("inertia", "damping"))
     if friction is not None:
-        check_number("friction", friction)
+        friction = check_number("friction", friction)
+    return friction, check_kind("torsion", torsion, bool)
 
 
 def _rebuild(model: Any, disabled: int, first: Any, options: dict[str, Any], now: Any, state: MujocoState) -> MujocoLCS:
