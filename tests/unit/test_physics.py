@@ -525,7 +525,7 @@ def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_g
      ({"center_of_mass": (0.0,)}, ShapeError, "center_of_mass"),
      ({"drive": "fast"}, DTypeError, "drive: expected Drive"),
      ({"cone": "flat"}, InvalidInputError, "cone: expected"),
-     ({"friction": "much"}, DTypeError, "friction: expected a number"),
+     ({"friction": "much"}, DTypeError, "friction: expected real numbers"),
      ({"nearest": 0}, InvalidInputError, "nearest"),
      ({"inertia": "heavy"}, DTypeError, "inertia: expected Inertia"),
      ({"inertia": Inertia(-1.0, 0.1)}, InvalidInputError, "mass: expected numbers above 0, got -1"),
