@@ -93,7 +93,6 @@ def test_a_log_and_its_episodes_are_the_same_transitions():
         (lambda d: Transitions.from_episodes([["a"], ["b"]], [[1.0]]), DTypeError, "states: expected real numbers"),
         (lambda d: Transitions.from_episodes([[[1.0, 2.0], [1.0]]], [[[1.0]]]), DTypeError, "states: expected numbers"),
         (lambda d: d.split(seed=-1), InvalidInputError, "seed: expected at least 0"),
-        (lambda d: fit_report("cart pole", *d), DTypeError, "lcs: expected an LCSModel"),
         (lambda d: fit_report(LCSModel(4, 1, 2, dtype=torch.float32), *d), DTypeError, "float32 like the system"),
         (lambda d: fit_report(cart_pole_between_walls(), *d, train=d[:2]), InvalidInputError, "train: expected x, u"),
         (lambda d: fit_report(cart_pole_between_walls(), *d, train=(d.x, d.u[1:], d.x)), ShapeError, "train u: .*N="),

@@ -146,7 +146,6 @@ def test_systems_and_data_of_other_sizes_are_refused(build, data):
     [
         (lambda s: replace(s, state=-s.state), InvalidInputError, "state: expected units above 0"),
         (lambda s: replace(s, center=s.center[1:]), ShapeError, "state: expected a number for each"),
-        (lambda s: replace(s, xi="0.1"), DTypeError, "xi: expected a number"),
         (lambda s: s.params(s), DTypeError, "params: expected LCSParams"),
         (lambda s: ScaledLCS(s, s), DTypeError, "lcs: expected LCSModule"),
         (lambda s: LCSModel.from_params(None), DTypeError, "params: expected LCSParams"),
