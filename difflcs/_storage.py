@@ -59,6 +59,15 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
+@contextmanager
+def place_to_write(path: Path) -> Iterator[None]:
+    """Turn what the system says of files that cannot be written into an error of ours."""
+    try:
+        yield
+    except OSError as error:
+        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
+
+
 def write_json(path: Path, value: object) -> None:
     """Write JSON atomically."""
     write_atomically(path, (json.dumps(value, indent=2, sort_keys=True) + "\n").encode())

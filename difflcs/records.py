@@ -22,7 +22,7 @@ from difflcs._checks import (
     takes_arrays,
     to_tensor,
 )
-from difflcs._differentiation import is_wrapped, runs_eagerly
+from difflcs._differentiation import is_wrapped, runs_eagerly, transforms_active
 from difflcs._linalg import matvec
 from difflcs._modules import fresh
 from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError
@@ -75,7 +75,8 @@ class SystemMatrices:
 
 def _numbers_of(tensor: Tensor) -> int | None:
     """Return a number that says whether the numbers of a tensor have changed; None where they cannot be read."""
-    return None if is_wrapped(tensor) else hash(tensor.detach().cpu().numpy().tobytes())
+    unread = transforms_active() or is_wrapped(tensor)
+    return None if unread else hash(tensor.detach().cpu().numpy().tobytes())
 
 
 # Name → kinds of its dimensions, in the order of every list of these matrices.
@@ -133,7 +134,7 @@ class _Record(SystemMatrices):
 
     def check_again(self) -> None:
         """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
-        if vars(self).get("_checked") != (now := _numbers_of(self.F)):
+        if (now := _numbers_of(self.F)) is not None and vars(self).get("_checked") != now:
             check_positive_definite(self.F)
             vars(self)["_checked"] = now
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from difflcs import zoo
 from difflcs._optional import require, versions
+from difflcs._storage import place_to_write
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.export import CONTROLLER, DESCRIPTION, export_controller
@@ -237,9 +238,8 @@ def film(learned: TrainedPolicy, task: TaskSpec, goals: Sequence[Sequence[float]
         raise NoPictureError(str(error)) from error
     try:
         _describe_env(learned, task, env)
-        return record_video(env, learned.policy, goals, path, task, seed)
-    except OSError as error:
-        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
+        with place_to_write(path):
+            return record_video(env, learned.policy, goals, path, task, seed)
     finally:
         env.close()
 

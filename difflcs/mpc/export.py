@@ -65,11 +65,9 @@ def export_controller(
         "u_max": _bound(high),
     }
     directory = Path(out)
-    try:
+    with _storage.place_to_write(directory):
         _storage.write_atomically(directory / CONTROLLER, content)
         _storage.write_json(directory / DESCRIPTION, description)
-    except OSError as error:
-        raise InvalidInputError(f"out: expected a place to write {out}, got: {error}; choose another") from error
     return directory / CONTROLLER
 
 

@@ -6,6 +6,7 @@ import torch
 from scipy.optimize import linprog
 
 from difflcs import ConstraintSequence, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
+from difflcs.errors import SolveWarning
 from difflcs.mpc import Primal, kkt
 from difflcs.mpc.problem import MPCProblem
 
@@ -141,3 +142,11 @@ def test_the_least_scale_does_not_grow_with_the_horizon(growth):
     x, lam = problem.rollout(u)
     primal = Primal(x, u, lam, mu)
     assert float(kkt.residual(problem, primal, kkt.multipliers(problem, primal))) > kkt.CERTIFIED
+
+
+def test_what_cannot_be_met_in_small_units_is_a_status():
+    rows = LinearConstraints(tensor([[1.0]]), tensor([-2.0]), tensor([[-3e4]]))
+    lcs, final = system([[1.0]], [[-3e4]]), cost(1, 1, q_final=[1.0])
+    mpc = LCSMPCLayer(lcs, final, 1, -1e-6, 1e-6, on_failure="mask", constraints=rows)
+    with pytest.warns(SolveWarning, match="INFEASIBLE|NUMERICAL"):
+        assert not bool(mpc(torch.zeros(1).double()).converged)

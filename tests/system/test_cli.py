@@ -460,6 +460,9 @@ def test_pictures_of_a_model(capsys, tmp_path, finished):
     assert run(capsys, "plot", finished, "--smoke", "--out", tmp_path / "run")[0] == 0
     assert run(capsys, "evaluate", "zoo:trifinger-cube", "--smoke", "--plot", tmp_path / "zoo")[0] == 0
     pictures = {str(p.relative_to(tmp_path)): p.read_bytes()[:4] for p in tmp_path.glob("*/*")}
+    code, _, err = run(capsys, "plot", finished, "--smoke", "--out", tmp_path / "run" / "fit.png")
+    assert code == 2
+    assert "expected a place to write" in err
     names = ("run/learning_curve", "run/fit", "run/episode", "zoo/fit", "zoo/episode")
     assert pictures == {f"{name}.png": b"\x89PNG" for name in names}
 

@@ -234,7 +234,9 @@ class BatchedBackend(Backend):
         refused = torch.nonzero(status == int(Status.INFEASIBLE)).squeeze(-1)
         if len(refused):
             part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
-            sure = kkt.certainly_missed(part, plans) & self._impossible(part, started)
+            sure = kkt.certainly_missed(part, plans)
+            if bool(torch.isinf(part.price).any()):  # else this is the solve for the least violations, which can be met
+                sure &= self._impossible(part, started)
             status[refused[~sure]] = int(Status.NUMERICAL)
 
     def _impossible(self, problem: MPCProblem, started: float) -> Tensor:

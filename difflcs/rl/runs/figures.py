@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from difflcs._optional import require
-from difflcs._storage import write_atomically
+from difflcs._storage import place_to_write, write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.fit import Transitions, fit_report
 from difflcs.mpc import LCSMPCLayer
@@ -135,8 +135,9 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
 def _write(figure: Figure, path: Path) -> None:
     from difflcs._figure import to_png
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, to_png(figure))
+    with place_to_write(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, to_png(figure))
 
 
 def _evaluation(first: str, *names: str) -> list[str]:
