@@ -464,18 +464,6 @@ def results(tmp_path):
     return tmp_path
 
 
-def test_stand_ins_are_a_table_of_their_own(results, capsys):
-    before = records.path_of(results, "paper").read_bytes()
-    unit = Unit("banana", "lcs-rl", "ours", FIRST)
-    path = records.add(results, "paper", unit_rows(unit, (1, 2, 3, 99), source="stand_in"))
-    assert path.name == "paper-stand-in.csv"
-    assert records.path_of(results, "paper").read_bytes() == before
-    assert run_script(table1.main, capsys, "--results", results)[0] == 0
-    assert "99.0" not in (results / "table1.md").read_text()
-    assert "99.0" in (results / "table1-stand-in.md").read_text()
-    assert "STAND-INS" in (results / "table1-stand-in.md").read_text()
-
-
 def test_nothing_is_mixed_or_replaced_silently(results, capsys):
     unit = Unit("mug", "lcs-rl", "ours", 0)
     # Other numbers of goals stand beside each other; the larger amount is shown, and what is left out is said.

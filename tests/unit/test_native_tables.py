@@ -5,14 +5,12 @@ import runpy
 from pathlib import Path
 
 import pytest
-import torch
 
 import difflcs
 from difflcs import Status
 from difflcs._native import _kernels
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.records import SYSTEM, LCSParams, dimensions
-from difflcs.status import solved
 
 SOURCE = Path(difflcs.__file__).parent
 
@@ -41,8 +39,3 @@ def test_the_system_is_the_same_everywhere():
 def test_the_codes_are_those_of_the_kernels():
     assert {s.name: int(s) for s in Status} == _kernels.status_codes()
     assert all(s.advice for s in Status)
-
-
-def test_what_is_solved_is_said_once():
-    codes = torch.tensor([int(s) for s in Status], dtype=torch.int8)
-    assert solved(codes).tolist() == [s.solved for s in Status]

@@ -530,10 +530,8 @@ def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_g
      ({"inertia": "heavy"}, DTypeError, "inertia: expected Inertia"),
      ({"inertia": Inertia(-1.0, 0.1)}, InvalidInputError, "mass: expected numbers above 0, got -1"),
      ({"inertia": Inertia(1.0, 0)}, InvalidInputError, "seconds: expected a finite number above 0"),
-     ({"drive": ForceDrive(0.0, 0.1)}, InvalidInputError, "mass: expected numbers above 0"),
      ({"drive": PDDrive(1.0, -2.0, 0.1, 3)}, InvalidInputError, "damping: expected numbers of at least 0"),
      ({"drive": PDDrive(1.0, 2.0, 0.1, -3)}, InvalidInputError, "substeps: expected at least 1"),
-     ({"drive": PDDrive(1.0, 2.0, -0.1, 3)}, InvalidInputError, "substep: expected a finite number above 0"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(wrong, error, match):
