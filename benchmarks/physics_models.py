@@ -130,7 +130,7 @@ class Simulated:
     """One step in MuJoCo from a state.
 
     Attributes:
-        after: (nv,) velocities.
+        after: (nv,) velocities; NaN where MuJoCo diverges.
         kind: "free", "contact" or "limit".
     """
 
@@ -153,7 +153,7 @@ class Simulated:
                 self.kind = "limit"
             elif self.kind == "free" and np.isin(active, CONTACTS).any():
                 self.kind = "contact"
-        self.after = data.qvel.copy()
+        self.after = data.qvel + np.where(data.warning.number.any(), np.nan, 0.0)
 
 
 @torch.no_grad()
