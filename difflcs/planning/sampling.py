@@ -28,7 +28,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_number, check_positive_int, check_tensor, make_plain
+from difflcs._checks import check_array, check_kind, check_number, check_positive_int, check_tensor, make_plain
 from difflcs.constraints import LinearConstraints
 from difflcs.errors import InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
@@ -158,7 +158,8 @@ class SamplingPolicy:
                 "the others"
             )
         self.mpc, self.places, self.travel, self.bounds = mpc, places, travel, bounds
-        self.settings, self.constraints = SamplingSettings() if settings is None else settings, constraints
+        self.settings = check_kind("settings", SamplingSettings() if settings is None else settings, SamplingSettings)
+        self.constraints = constraints
         self.angles = list(angles)
         self.reset()
 
@@ -202,12 +203,12 @@ class SamplingPolicy:
             return self._decide(state, target, context, stay=place is not None)
 
     def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
-        state = check_tensor("x", torch.as_tensor(x, dtype=torch.float64).detach(), [("n_x", self.mpc.lcs.n_x)])
+        state = check_tensor("x", torch.from_numpy(check_array("x", x)), [("n_x", self.mpc.lcs.n_x)])
         if state.ndim != 1:
             raise ShapeError(f"x: expected shape ({self.mpc.lcs.n_x},), got {tuple(state.shape)}; give one robot's")
         if goal is None:
             return state, None
-        target = check_tensor("goal", torch.as_tensor(goal, dtype=torch.float64).detach().clone())
+        target = check_tensor("goal", torch.from_numpy(check_array("goal", goal).copy()))
         if target.ndim != 1 or any(index >= len(target) for index in self.angles):
             raise ShapeError(
                 f"goal: expected one vector that has the angles {self.angles}, got shape {tuple(target.shape)}; "

@@ -289,8 +289,9 @@ def test_bad_input_is_refused():
     mpc = LCSMPCLayer(Line(), GoalCost.reach(2, 1), 4)
     with pytest.raises(InvalidInputError, match="on_failure"):
         SamplingPolicy(mpc, Sides(), Jump())
-    with pytest.raises(DTypeError, match="LCSMPCLayer"):
-        SamplingPolicy(Line(), Sides(), Jump())
+    for wrong in (lambda: SamplingPolicy(Line(), Sides(), Jump()), lambda: policy.act(["a", 0.0], [1.0])):
+        with pytest.raises(DTypeError, match=r"LCSMPCLayer|x: expected real numbers"):
+            wrong()
 
 
 @pytest.mark.parametrize(
