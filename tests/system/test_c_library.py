@@ -155,9 +155,6 @@ def test_nothing_but_the_header_is_to_be_seen(installed):
     assert len(declared) >= 12
 
 
-# --- difflcs export ---------------------------------------------------------------------------------------------------
-
-
 def test_what_export_writes(exported, capsys):
     described = json.loads((exported / "controller.json").read_text())
     assert described["task"] == "cube"

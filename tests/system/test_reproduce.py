@@ -379,6 +379,17 @@ def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatc
     assert job.result() is None
 
 
+def test_ctrl_c_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "compute", interrupt)
+    monkeypatch.setattr(runs, "connect", lambda *arguments: contextlib.nullcontext())
+    code, _, err = run_script(run_runs, capsys, "--methods", "pddm", "--work", tmp_path, "--results", tmp_path)
+    assert code == 130
+    assert "the same command goes on" in err
+
+
 def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runs, "connect", lambda workers: contextlib.nullcontext(local))
     options = ["--rerun", "--preset", "smoke", "--objects", "mug", "--methods", "violation"]

@@ -70,9 +70,6 @@ def drawn(seed: int) -> np.ndarray:
     return rng.integers(2, size=STEPS)
 
 
-# --- the environment --------------------------------------------------------------------------------
-
-
 def test_steps_are_those_of_the_drawn_networks():
     env = make_env()
     observation, info = env.reset(seed=[4, 5, 6])
@@ -149,9 +146,6 @@ def test_foreseen_is_what_was_played():
     expected, reached = outcome(*other, goals.repeat_interleave(STEPS, 0), ended)
     torch.testing.assert_close(reward[:, :, 1].flatten(), expected)
     assert torch.equal(success[:, :, 1].flatten(), reached)
-
-
-# --- data and ensemble ------------------------------------------------------------------------------
 
 
 def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):

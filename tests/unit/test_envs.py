@@ -278,6 +278,13 @@ def test_the_goal_is_an_outline_that_hides_nothing(camera):
     env.close()
 
 
+def test_render_without_mode_warns():
+    env = make()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render mode"):
+        assert env.render() is None
+
+
 def test_broken_opengl_names_the_packages(monkeypatch):
     env = make(render_mode="rgb_array")
     env.reset(seed=0)

@@ -83,9 +83,6 @@ def test_the_outcome_of_a_step_needs_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- what is known of the physics -------------------------------------------------------------------------------------
-
-
 def test_the_cost_of_contact_plans_is_what_it_says():
     cost, rng = contact_cost(), torch.Generator().manual_seed(0)
     x, u, goal = (torch.randn(5, n, dtype=torch.float64, generator=rng) for n in (9, 6, 3))

@@ -128,6 +128,12 @@ def test_grad_is_backward(layer, x0):
     close(vmap(grad(loss), in_dims=1, out_dims=1)(x0.T), plain.T)
 
 
+def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):
+    """The gradient of the objective does not move linearly with x0; a constant would be wrong in silence."""
+    with pytest.raises(e.DoubleBackwardError):
+        grad(lambda x: grad(lambda y: layer(y).objective)(x).sum())(x0[0])
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode
 @pytest.mark.parametrize("learnable", [True, False])
 def test_forward_mode_is_refused_whatever_requires_a_gradient(layer, x0, learnable):

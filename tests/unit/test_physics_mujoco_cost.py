@@ -68,9 +68,6 @@ def stage_cost(found, x):
     return 0.5 * x @ found.Q @ x + found.q @ x + found.constant_stage
 
 
-# --- the squares ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", TERMS)
 def test_value_and_gradient_at_the_state_are_those_of_the_squares(name):
     cost, x, module = make([Effort(), TERMS[name]])

@@ -116,9 +116,6 @@ def test_json_that_does_not_fit_is_refused(change, message):
         from_json(plain, Outer)
 
 
-# --- everything that a training takes ---------------------------------------------------------------------------------
-
-
 def groups(kind: type[Any]) -> Iterator[type[Any]]:
     """A dataclass of settings and those in it."""
     yield kind
@@ -161,9 +158,6 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
         assert f.name in known, f"{kind.__name__}.{f.name} has no docstring"
         if numbers_in(hints[f.name]):
             assert any(bound is not None for bound in f.metadata.values()), f"{kind.__name__}.{f.name} has no bounds"
-
-
-# --- the configuration of a training ----------------------------------------------------------------------------------
 
 
 def test_a_method_stands_for_its_name():

@@ -141,9 +141,6 @@ def test_bad_values_are_refused(change, error, message):
         make_task(**change)
 
 
-# --- registry ---------------------------------------------------------------------------------------------------------
-
-
 def test_a_registered_task_is_found_and_replaced_by_its_name():
     assert get_task(TOY) is TOY  # registered or not
     mine = make_task("unit-toy")
