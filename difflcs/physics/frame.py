@@ -125,7 +125,7 @@ class BodyFrameLCS(LCSModel):
         """
         if x is None:
             raise InvalidInputError("x: expected the states of the system, got None; pass them")
-        check_tensor("x", x, [("n_x", self.n_x)])
+        x = check_tensor("x", x, [("n_x", self.n_x)]).to(self.A)
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)
         yaw = x @ self.yaw

@@ -74,7 +74,7 @@ def test_files_and_frames(lcs, tmp_path, build):
     lcs.save_pretrained(tmp_path)
     again = BodyFrameLCS.from_pretrained(tmp_path)
     assert again.frame == FRAME._replace(vectors=((0, 2), (3, 1)))
-    torch.testing.assert_close(again.params(x).A, lcs.params(x).A, rtol=0, atol=0)
+    torch.testing.assert_close(again.params(x.float()).A, lcs.params(x.float().double()).A, rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="BodyFrameLCS"):
         LCSModel.from_pretrained(tmp_path)
     for wrong in (FRAME._replace(yaw=8), FRAME._replace(yaw=1), FRAME._replace(vectors=((0, 5),))):
