@@ -1,0 +1,330 @@
+"""Three fingers turn and move objects on a table: `python examples/trifinger_turn.py --assets DIR --objects cube,mug`.
+
+Task and models are those of Jin's TriFinger (github.com/asu-iris/Complementarity-Free-Dexterous-Manipulation), whose
+folder `envs` DIR has to be. An object lies within 5 cm of the middle at a yaw uniform in ±90°; its goal is drawn
+likewise. A decision moves the targets of nine joints by at most 0.01 rad from where they are; torques follow them for
+20 steps of 2 ms. Success: within 2 cm and 1 − (q·goal)² < 0.04 (23°) after each of 21 decisions in a row, of 500.
+
+The controller knows model and state. It is that of the Allegro hand (`benchmarks/scoreboard/inhand.py`) in small: a
+quasi-dynamic `MujocoLCS` and a `MujocoCost`, linearised where robot and object are; a planned step is tried in MuJoCo,
+and the fingers let go and take the object anew where it comes no nearer.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from dataclasses import dataclass, field
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+
+from difflcs import LCSMPCLayer
+from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.physics.mujoco import ContactGroup, Effort, MujocoCost, MujocoLCS, Orientation, Position
+from difflcs.rl import wilson_interval
+
+HEIGHTS = {  # of the objects' centres at the start and at the goal, as published [m]
+    "airplane": 0.015,
+    "binoculars": 0.04,
+    "bowl": 0.023,
+    "bunny": 0.03,
+    "camera": 0.03,
+    "can": 0.033,
+    "cube": 0.03,
+    "cup": 0.025,
+    "elephant": 0.03,
+    "foambrick": 0.025,
+    "mug": 0.033,
+    "piggy_bank": 0.035,
+    "rubber_duck": 0.05,
+    "stick": 0.018,
+    "teapot": 0.028,
+    "torus": 0.018,
+    "water_bottle": 0.055,
+}
+JOINTS = np.tile([0.0, -0.7, -1.1], 3)
+FINGERS = "fingertip_0", "fingertip_120", "fingertip_240"
+STIFFNESS, DAMPING = 10.0, 0.05  # of the torques, as published [Nm/rad, Nms/rad]
+LIMIT, HELD, SUBSTEPS, DECISIONS, SECONDS = 0.01, 21, 20, 500, 0.04
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of the controller, the same for all objects."""
+
+    horizon: int = 4
+    friction: float = 0.5
+    inertia: float = 5.0
+    """Factor of the inertia of rotation."""
+    compliance: float = 0.1
+    relaxation: float = 1e-3
+    place: float = 2000.0
+    turn: float = 18.75
+    reach: float = 0.5
+    """Angle up to which a goal that is farther away pulls harder [rad]."""
+    near: float = 8.0
+    """Weight of the distances of fingertips from what they are drawn to."""
+    effort: float = 2.0
+    pace: float = 3.0
+    """Duration of a step of the plan, in decisions."""
+    paces: tuple[float, ...] = (1.0, 0.4)
+    """Factors by which the planned step is tried in MuJoCo, the fastest first; none: it is executed untried."""
+    gain: float = 0.02
+    """Cost by which a step has to end better than now for no slower one to be tried."""
+    slack: float = 0.005
+    """Cost by which a faster step may end worse than the best."""
+    ring: float = 0.05
+    """Distance from the object's middle of the points to which fingertips are drawn, one of them behind it [m]."""
+    patience: int = 25
+    """Decisions without progress after which the fingers go over the object and round it, and take it anew."""
+    opening: int = 60
+    """Decisions of that, a third each to lift them, to bring them round it, and to lower them."""
+    high: float = 0.1
+    """Height to which they are lifted [m]."""
+    apart: float = 0.015
+    """Distance from the object at which they come down [m]."""
+
+
+@dataclass
+class Options:
+    """Three fingers that turn and move objects on a table."""
+
+    assets: Path
+    """Folder `envs` of the published code, with its `xmls` and `assets`."""
+    objects: str = "all"
+    """Names with commas; all: those that are there."""
+    episodes: int = 20
+    """Episodes of each object, of seeds `seed`, `seed` + 1, …"""
+    seed: int = 0
+    """Seed of the first episode."""
+    out: Path | None = None
+    """Where episodes are recorded, a line of JSON each, and not played again."""
+    settings: Settings = field(default_factory=Settings)
+
+
+def yaw_quaternion(angle: float) -> np.ndarray:
+    """Quaternion of a turn about the vertical."""
+    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+
+
+def make_task(folder: Path, name: str, seed: int) -> tuple[Any, Any, Any, np.ndarray, np.ndarray]:
+    """Model, the same with servos and weightless fingers, data at the start, target place and target quaternion."""
+    random = np.random.RandomState(100 + seed)
+    xy, yaw = 0.1 * random.rand(2) - 0.05, -np.pi * random.rand() + np.pi / 2
+    place = np.append(0.1 * random.rand(2) - 0.05, HEIGHTS[name])
+    goal = yaw_quaternion(np.pi * random.rand() - np.pi / 2)
+    path = str(folder / "xmls" / f"env_trifinger_{name}.xml")
+    spec = mujoco.MjSpec.from_file(path)
+    model = spec.compile()
+    for motor in spec.actuators:
+        motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
+    for body in spec.bodies:
+        if body.name.startswith("finger_"):
+            body.gravcomp = 1.0
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.concatenate([xy, [HEIGHTS[name]], yaw_quaternion(yaw), JOINTS])
+    mujoco.mj_forward(model, data)
+    return model, spec.compile(), data, place, goal
+
+
+def follow(model: Any, data: Any, target: np.ndarray) -> None:
+    """Simulate a decision: torques that draw the joints to a target, as published."""
+    for _ in range(SUBSTEPS):
+        mujoco.mj_forward(model, data)
+        data.ctrl[:] = STIFFNESS * (target - data.qpos[7:]) - DAMPING * data.qvel[6:] + data.qfrc_bias[6:]
+        mujoco.mj_step(model, data)
+
+
+class Policy:
+    """Contact MPC: a quasi-dynamic system and a cost in task space, both linearised where robot and object are."""
+
+    def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
+        self.settings, self.place, self.goal, self.twin = settings, place, goal, model.__copy__()
+        s, model = settings, model.__copy__()
+        self.twin.opt.timestep, self.twin.opt.tolerance = 0.004, 1e-5
+        self.twin.geom_condim[:] = np.minimum(self.twin.geom_condim, 4)
+        self.tried = mujoco.MjData(self.twin)
+        model.body_inertia[model.body("obj").id] *= s.inertia
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        self.module = MujocoLCS(
+            model,
+            data,
+            motion="quasi-dynamic",
+            seconds=s.pace * SECONDS,
+            torsion=False,
+            contacts=[
+                ContactGroup(("obj", "table"), 4),
+                *(ContactGroup(("obj", finger), 2) for finger in FINGERS),
+                ContactGroup(None, 3, friction=False, distance=0.01),
+            ],
+            distance=0.04,
+            friction=s.friction,
+            compliance=s.compliance,
+            length=0.03,
+            limits=0,
+        )
+        cost = MujocoCost(
+            self.module,
+            [
+                Position("body:obj", weight=0.0, weight_final=s.place),
+                Orientation("body:obj", weight=0.0, weight_final=s.turn, reach=s.reach),
+                *(Position(f"site:{finger}", weight=s.near, weight_final=0.0) for finger in FINGERS),
+                Effort(s.effort),
+            ],
+        )
+        far = s.pace * LIMIT
+        solver = BatchedBackend(restarts=1, threads=1)
+        self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
+        self.random, self.best, self.waited, self.times = np.random.RandomState(0), np.inf, 0, []
+        self.geom = model.geom("obj").id
+        self.turned = 0.0
+
+    def angle(self, data: Any) -> float:
+        """Angle by which the object is still to be turned [rad]."""
+        return 2 * np.arccos(min(1.0, abs(float(data.qpos[3:7] @ self.goal))))
+
+    def stalls(self, data: Any) -> bool:
+        """Tell whether the object has not come nearer for too long: then the fingers let go for some decisions."""
+        s, left = self.settings, self.angle(data) + 20 * float(np.linalg.norm(data.qpos[:2] - self.place[:2]))
+        self.waited += 1
+        if self.waited > 0 and left < max(self.best - 0.05, 0.4):
+            self.best, self.waited = min(left, self.best), 0
+        if self.waited > s.patience:
+            self.best, self.waited = np.inf, -s.opening
+        return self.waited < 0
+
+    def around(self, data: Any, radius: float) -> np.ndarray:
+        """Points (3, 3) round the object for the fingertips, one of them behind it as seen from its place."""
+        here = data.qpos[:3]
+        away, tips = here - self.place, np.array([data.site(finger).xpos for finger in FINGERS])
+        if np.linalg.norm(away[:2]) < 0.01:
+            return np.tile(here, (3, 1))
+        angles = np.arctan2(away[1], away[0]) + np.array([0.0, 2.0, -2.0]) * np.pi / 3
+        own = np.arctan2(*(tips - here).T[[1, 0]])
+        gap = np.abs((own[:, None] - angles + np.pi) % (2 * np.pi) - np.pi)
+        order = min(permutations(range(3)), key=lambda order: sum(gap[range(3), order] ** 2))
+        chosen = angles[list(order)] + self.turned
+        return here + radius * np.stack([np.cos(chosen), np.sin(chosen), np.zeros(3)], -1)
+
+    def reach(self, data: Any, points: np.ndarray) -> np.ndarray:
+        """Targets of the joints that bring the fingertips nearer to points (3, 3)."""
+        jacobian, moves = np.zeros((3, self.twin.nv)), []
+        for i, finger in enumerate(FINGERS):
+            mujoco.mj_jacSite(self.twin, data, jacobian, None, self.twin.site(finger).id)
+            own = jacobian[:, 6 + 3 * i : 9 + 3 * i]
+            move = np.linalg.solve(own.T @ own + 1e-4 * np.eye(3), own.T @ (points[i] - data.site(finger).xpos))
+            moves.append(move * min(1.0, LIMIT / np.abs(move).max()))
+        return data.qpos[7:] + np.concatenate(moves)
+
+    def act(self, data: Any) -> np.ndarray:
+        """Targets of the joints for the next decision."""
+        s = self.settings
+        if self.stalls(data):
+            self.mpc.reset()
+            if self.waited == -s.opening:
+                self.turned = 0.5 * self.random.randn()
+            points = np.array([data.site(finger).xpos for finger in FINGERS])
+            if self.waited >= -2 * s.opening // 3:
+                points = self.around(data, s.apart + float(self.twin.geom_aabb[self.geom, 3:].max()))
+            points[:, 2] = s.high if self.waited < -s.opening // 3 else self.place[2]
+            return self.reach(data, points)
+        begun = time.thread_time()
+        points = self.around(data, s.ring)
+        action = self.mpc.step(self.module.observe(data), np.concatenate([self.place, self.goal, *points]))
+        move = self.rehearse(data, np.clip(action / s.pace, -LIMIT, LIMIT))
+        self.times.append(1e3 * (time.thread_time() - begun))
+        return data.qpos[7:] + move
+
+    def rehearse(self, data: Any, move: np.ndarray) -> np.ndarray:
+        """Try a step at some paces in MuJoCo: the fastest that ends about as well as the best."""
+        s, ends = self.settings, []
+        if not s.paces:
+            return move
+        now = self.miss(data)
+        for pace in s.paces:
+            mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
+            self.tried.ctrl[:] = data.qpos[7:] + pace * move
+            mujoco.mj_step(self.twin, self.tried, round(SECONDS / self.twin.opt.timestep))
+            ends.append(self.miss(self.tried))
+            if ends[-1] < now - s.gain:
+                break
+        return next(pace for pace, end in zip(s.paces, ends, strict=False) if end <= min(ends) + s.slack) * move
+
+    def miss(self, data: Any) -> float:
+        """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""
+        s, left = self.settings, self.angle(data)
+        square = float(np.sum((data.qpos[:3] + 0.1 * data.qvel[:3] - self.place) ** 2))
+        near = min(left, s.reach)
+        return s.place * square + s.turn * near * (2 * left - near)
+
+
+def play(o: Options, name: str, seed: int) -> dict[str, Any]:
+    """One episode."""
+    model, servos, data, place, goal = make_task(o.assets, name, seed)
+    policy, held, steps = Policy(servos, data, place, goal, o.settings), 0, 0
+    while held < HELD and steps < DECISIONS:
+        follow(model, data, policy.act(data))
+        wrong, apart = 1 - float(data.qpos[3:7] @ goal) ** 2, float(np.linalg.norm(data.qpos[:3] - place))
+        held = (held + 1) * (wrong < 0.04 and apart < 0.02)
+        steps += 1
+    return {
+        "object": name,
+        "seed": seed,
+        "success": held == HELD,
+        "steps": steps,
+        "position_mm": 1e3 * apart,
+        "angle_deg": 2 * np.degrees(np.arcsin(np.sqrt(np.clip(wrong, 0, 1)))),
+        "milliseconds": float(np.mean(policy.times)),
+    }
+
+
+def is_there(folder: Path, name: str) -> bool:
+    """Tell whether the files of an object can be read: not all of its meshes may have been copied."""
+    try:
+        make_task(folder, name, 0)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def main(o: Options) -> None:
+    """Play, print, record."""
+    there = [name for name in HEIGHTS if is_there(o.assets, name)]
+    names = there if o.objects == "all" else o.objects.split(",")
+    if not names or set(names) - set(there):
+        raise InvalidInputError(
+            f"objects: expected some of {', '.join(there) or 'nothing'}, whose files are in {o.assets}, got "
+            f"{o.objects!r}; pass --assets DIR with the published xmls/env_trifinger_*.xml"
+        )
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", ContactWarning)
+    lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
+    known = {(e["object"], e["seed"]): e for e in map(json.loads, lines)}
+    for name in [*names, "all"]:
+        keys = [(n, o.seed + i) for n in names for i in range(o.episodes) if name in (n, "all")]
+        for key in keys:
+            if key not in known:
+                known[key] = play(o, *key)
+                if o.out is not None:
+                    with open(o.out, "a") as file:
+                        file.write(json.dumps(known[key]) + "\n")
+        rows = [known[key] for key in keys]
+        good = [e for e in rows if e["success"]]
+        low, high = wilson_interval(len(good), len(rows))
+        means = {
+            k: np.mean([e[k] for e in good or rows]) for k in ("steps", "position_mm", "angle_deg", "milliseconds")
+        }
+        text = ", ".join(f"{key} {value:.3g}" for key, value in means.items())
+        print(f"{name}: {len(good)} of {len(rows)} ({100 * low:.1f} to {100 * high:.1f} %); {text}", flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
