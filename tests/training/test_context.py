@@ -245,5 +245,5 @@ def test_a_system_without_gradient_is_refused(update):
 
 def test_a_sequence_is_no_system_of_transitions():
     x = torch.zeros(4, 1, dtype=torch.float64)
-    with pytest.raises(DTypeError, match="expected LCSParams for transitions"):
+    with pytest.raises(DTypeError, match=r"expected LCSParams, .*; transitions have no stages"):
         fit(Stages(1, 1, 1), x, x, x, WarmupSettings(), 1, np.random.default_rng(0))
