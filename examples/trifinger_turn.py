@@ -12,10 +12,10 @@ and the fingers let go and take the object anew where it comes no nearer.
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from recorded import Recorded
 
 from difflcs import LCSMPCLayer
 from difflcs.errors import ContactWarning, InvalidInputError
@@ -121,8 +122,7 @@ def make_task(folder: Path, name: str, seed: int) -> tuple[Any, Any, Any, np.nda
     xy, yaw = 0.1 * random.rand(2) - 0.05, -np.pi * random.rand() + np.pi / 2
     place = np.append(0.1 * random.rand(2) - 0.05, HEIGHTS[name])
     goal = yaw_quaternion(np.pi * random.rand() - np.pi / 2)
-    path = str(folder / "xmls" / f"env_trifinger_{name}.xml")
-    spec = mujoco.MjSpec.from_file(path)
+    spec = mujoco.MjSpec.from_file(str(folder / "xmls" / f"env_trifinger_{name}.xml"))
     model = spec.compile()
     for motor in spec.actuators:
         motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
@@ -141,6 +141,11 @@ def follow(model: Any, data: Any, target: np.ndarray) -> None:
         mujoco.mj_forward(model, data)
         data.ctrl[:] = STIFFNESS * (target - data.qpos[7:]) - DAMPING * data.qvel[6:] + data.qfrc_bias[6:]
         mujoco.mj_step(model, data)
+
+
+def find_tips(data: Any) -> np.ndarray:
+    """Places (3, 3) of the fingertips."""
+    return np.array([data.site(finger).xpos for finger in FINGERS])
 
 
 class Policy:
@@ -204,7 +209,7 @@ class Policy:
     def around(self, data: Any, radius: float) -> np.ndarray:
         """Points (3, 3) round the object for the fingertips, one of them behind it as seen from its place."""
         here = data.qpos[:3]
-        away, tips = here - self.place, np.array([data.site(finger).xpos for finger in FINGERS])
+        away, tips = here - self.place, find_tips(data)
         if np.linalg.norm(away[:2]) < 0.01:
             return np.tile(here, (3, 1))
         angles = np.arctan2(away[1], away[0]) + np.array([0.0, 2.0, -2.0]) * np.pi / 3
@@ -231,7 +236,7 @@ class Policy:
             self.mpc.reset()
             if self.waited == -s.opening:
                 self.turned = 0.5 * self.random.randn()
-            points = np.array([data.site(finger).xpos for finger in FINGERS])
+            points = find_tips(data)
             if self.waited >= -2 * s.opening // 3:
                 points = self.around(data, s.apart + float(self.twin.geom_aabb[self.geom, 3:].max()))
             points[:, 2] = s.high if self.waited < -s.opening // 3 else self.place[2]
@@ -306,17 +311,9 @@ def main(o: Options) -> None:
         )
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
-    lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
-    known = {(e["object"], e["seed"]): e for e in map(json.loads, lines)}
+    recorded = Recorded(partial(play, o), o.out)
     for name in [*names, "all"]:
-        keys = [(n, o.seed + i) for n in names for i in range(o.episodes) if name in (n, "all")]
-        for key in keys:
-            if key not in known:
-                known[key] = play(o, *key)
-                if o.out is not None:
-                    with open(o.out, "a") as file:
-                        file.write(json.dumps(known[key]) + "\n")
-        rows = [known[key] for key in keys]
+        rows = recorded.episodes((n, o.seed + i) for n in names for i in range(o.episodes) if name in (n, "all"))
         good = [e for e in rows if e["success"]]
         low, high = wilson_interval(len(good), len(rows))
         means = {

@@ -21,9 +21,11 @@ chosen with seeds below 1500; final figures are of seeds 5000 and up. Times are 
 import copy
 import json
 import os
+import sys
 import time
 import warnings
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +40,10 @@ from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Effort, MujocoCost, MujocoLCS, Orientation, Position
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
+from recorded import Recorded
+from trifinger_turn import yaw_quaternion
 
 OBJECTS = {  # place of the start [m], its height, and the target place, as published
     "airplane": ((-0.03, -0.01), 0.03, (-0.02, -0.01, 0.03)),
@@ -133,11 +139,6 @@ class Options:
     results: Path | None = None
     """File for the figures of each object and of all, with their episodes."""
     settings: Settings = field(default_factory=Settings)
-
-
-def yaw_quaternion(angle: float) -> np.ndarray:
-    """Quaternion of a turn about the vertical."""
-    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
 
 
 def next_goal(random: np.random.RandomState, axes: str, last: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -365,24 +366,17 @@ def main(o: Options) -> None:
         )
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
-    lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
-    known = {(e["object"], e["seed"]): e for e in map(json.loads, lines)}
-    results, keys = {}, []
+    recorded, results, episodes = Recorded(partial(play, o), o.out), {}, []
     for name in [*names, "all"]:
         keys = [(n, o.seed + i) for n in names for i in range(o.episodes) if name in (n, "all")]
-        for key in keys:
-            if key not in known:
-                known[key] = play(o, *key)
-                if o.out is not None:
-                    with o.out.open("a") as file:
-                        file.write(json.dumps(known[key]) + "\n")
-        results[name] = found = figures([known[key] for key in keys])
+        episodes = recorded.episodes(keys)
+        results[name] = found = figures(episodes)
         text = ", ".join(f"{key} {value:.4g}" for key, value in found.items() if isinstance(value, (int, float)))
         print(json.dumps({"object": name, **found}) if o.json else f"{name}: {success_text(found)}; {text}", flush=True)
     if o.results is not None:
         asked = {key: getattr(o, key) for key in ("seed", "position", "axes", "seconds", "tilt")}
         record = {"machine": machine(), **asked, "settings": asdict(o.settings), "results": results}
-        save(o.results, {**record, "columns": COLUMNS, "rows": [[known[key][c] for c in COLUMNS] for key in keys]})
+        save(o.results, {**record, "columns": COLUMNS, "rows": [[e[c] for c in COLUMNS] for e in episodes]})
 
 
 if __name__ == "__main__":
