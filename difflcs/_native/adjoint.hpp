@@ -100,7 +100,6 @@ class Adjoint {
   // equations are a (dx, du) = target instead. Returns by how much they are missed, in parts of it.
   Vec hold_constraints(bool moved) {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c();
-    T* weight = problem.weight;
     Vec missed = all(0);
     Mask refining = ~Mask{};
     for (int64_t k = 0; k <= n.h; k++)
@@ -109,7 +108,7 @@ class Adjoint {
         riccati.force(k, i) = m;
         out.dm(k, i) = all(0);
         riccati.stiffness(k, i) =
-            select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
+            select((m > 0) & (m < kAtPrice * problem.price[k][i]), kHold * problem.weight, all(0));
       }
     const auto pull = [&](int64_t k, int64_t r) {
       return moved ? out.dm(k, r) - riccati.stiffness(k, r) * out.target(k, r) : out.dm(k, r);

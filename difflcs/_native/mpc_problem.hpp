@@ -138,7 +138,6 @@ struct ProblemData {
   Steps<T> row_scale;
   // The cost is kept in units of 1 / cost_unit: weights below 1e-3 are lifted to one, so that tolerances hold for them.
   T* cost_unit;
-  T* weight;      // largest weight of the cost
   Steps<T> rest;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
   LowRank low_rank;  // of F
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
@@ -147,8 +146,8 @@ struct ProblemData {
   Vec* product;  // of a matrix and a state
   Vec* reach;  // of each constraint: the least unit of its violation, a part of its largest change in a step
   Vec mu;      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
-  Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
-  Vec rho;
+  Matrix<Vec, 0, 0> multiplier;  // of the constraints
+  Vec rho, weight{};  // of the augmented Lagrangian, and the largest weight of the cost, its unit
 
   void (ProblemData::*load_rows)(int64_t element, int lane);  // `load_sized_rows` with the sizes that are known
 
@@ -172,7 +171,7 @@ struct ProblemData {
     arena.take(R, costs, nu, nu);
     arena.take(cross, costs, nx, nu);
     arena.take(Q_final, nx, nx);
-    arena.take_all(1, cost_unit, weight);
+    arena.take(cost_unit, 1);
     arena.take(rest, h, nu);
     arena.take(G, rows, nc, nw);
     arena.take(row_scale, rows, nc);
@@ -232,10 +231,8 @@ struct ProblemData {
         for (int64_t j = 0; j < to.columns; j++)
           put(to[i], j, lane, from[i * to.columns + j] * (by_row(i) * by_column(j)));
     };
-    put(weight, 0, lane, largest_weight(e));
-    put(cost_unit, 0, lane, caller_units ? 1.0 : unit_of(lane_of(weight[0], lane)));
+    put(cost_unit, 0, lane, caller_units ? 1.0 : unit_of(largest_weight(e)));
     const auto cost = [&](int64_t) { return lane_of(cost_unit[0], lane); };
-    put(weight, 0, lane, lane_of(weight[0], lane) > kTiny ? lane_of(weight[0], lane) * cost(0) : 1.0);
     for (int64_t k = 0; k < scale.count; k++) {
       const double* diagonal = input(kF, e, k);
       for (int64_t i = 0; i < nl; i++) {
@@ -344,6 +341,7 @@ struct ProblemData {
         put(g[k], i, lane, input(kg, e, k)[i] * unit);
         put(price[k], i, lane, input(kprice, e, k)[i] * (cost / unit));
       }
+    double widest = 0;  // change of a constraint
     for (int64_t i = 0; i < n.c(); i++) {
       double most = 0;
       for (int64_t k = 0; k <= n.h; k++) {
@@ -360,7 +358,25 @@ struct ProblemData {
         most = sum > most && lane_of(to.g[i], lane) < kHuge ? sum : most;
       }
       put(reach, i, lane, kCancelled * most);
+      widest = most > widest ? most : widest;
     }
+    if (n.c() > 0) put(&weight, 0, lane, weight_of(e, lane, widest));
+  }
+
+  // The largest weight of the cost. A linear cost has none: there it is the one that makes as much of the largest
+  // change of a constraint as the cost changes.
+  double weight_of(int64_t e, int lane, double widest) const {
+    const double largest = largest_weight(e);
+    if (largest > kTiny) return largest * lane_of(cost_unit[0], lane);
+    const StageData<T, AnySizes> at = stage(0);
+    double change = 0;
+    for (int64_t j = 0; j < n.u(); j++) {
+      Vec slope = abs(at.r[j]);
+      for (int64_t i = 0; i < n.x(); i++) slope += abs(at.B()(i, j) * (abs(at.q[i]) + abs(q_final[i])));
+      change += at.per_width[j][lane] > 0 ? slope[lane] / at.per_width[j][lane] : 0.0;
+    }
+    const double balanced = change / (widest * widest);
+    return balanced > kTiny && balanced < kHuge ? balanced : 1.0;
   }
 
   // One lane of an array from and to the caller's, lam from and to the caller's units.

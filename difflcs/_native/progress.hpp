@@ -133,7 +133,7 @@ struct Progress {
     if (!released[l]) eps[l] = first_relaxation(o.start[e], 0);
     problem.load(e, l);
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
-    put(&problem.rho, 0, l, kPenalty * lane_of(problem.weight[0], l));
+    put(&problem.rho, 0, l, kPenalty * problem.weight[l]);
     for (int64_t i = 0; i < actions; i++) {
       const double low = problem.u_min[i / nu][i % nu][l], high = problem.u_max[i / nu][i % nu][l];
       const double margin = batch.barrier > 0 ? 0.01 * (high - low) : 0.0;
@@ -247,10 +247,9 @@ struct Progress {
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
       const bool doubtful =
           small && !stationary && met(sweep, l) && !broken && (a.without_gain == kStepsBeforeCertificate || stuck);
-      const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
       const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
                               sweep.largest_multiplier[l] > kDominates * sweep.cost_gradient[l] &&
-                              (problem.rho[l] >= largest || a.iterations >= o.max_iter);
+                              (problem.rho[l] >= kLargestPenalty * problem.weight[l] || a.iterations >= o.max_iter);
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 &&
           update_due_multipliers(sweep, l, stationary || (small && a.without_gain >= kStepsBeforeCertificate))) {
         frozen[l] = -1;
@@ -264,7 +263,7 @@ struct Progress {
         continue;
       }
       const bool done = doubtful && accepted(o, l, sweep, force);
-      const double first = kPenalty * lane_of(problem.weight[0], l);
+      const double first = kPenalty * problem.weight[l];
       if (doubtful && !a.weight_reset && problem.rho[l] > first && o.residual[a.element] > kRoundingLeft) {
         frozen[l] = -1;
         update_multipliers(lane_mask(l));

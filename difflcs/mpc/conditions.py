@@ -1,7 +1,4 @@
-"""Optimality conditions of the LCS-MPC: the multipliers of a trajectory, and how far it violates them.
-
-The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
-"""
+"""Optimality conditions of the LCS-MPC, derived in `difflcs.mpc.kkt`: multipliers, and how far they are violated."""
 
 from dataclasses import dataclass
 

@@ -63,37 +63,12 @@ import torch
 from torch import Tensor
 
 from difflcs._linalg import matvec
-from difflcs.mpc.conditions import (
-    CERTIFIED,
-    Multipliers,
-    certainly_missed,
-    complete,
-    excess,
-    multipliers,
-    prices,
-    residual,
-    within_prices,
-)
+from difflcs.mpc.conditions import CERTIFIED, Multipliers, complete, multipliers, residual, within_prices
 from difflcs.mpc.problem import MPCProblem
-from difflcs.mpc.riccati import Linearisation, barrier_curvature, linearise, solve
+from difflcs.mpc.riccati import Linearisation, linearise, solve
 from difflcs.mpc.solution import Primal
 
-__all__ = [
-    "CERTIFIED",
-    "Linearisation",
-    "Multipliers",
-    "barrier_curvature",
-    "certainly_missed",
-    "complete",
-    "excess",
-    "linearise",
-    "multipliers",
-    "polish",
-    "prices",
-    "residual",
-    "vjp",
-    "within_prices",
-]
+__all__ = ["CERTIFIED", "Linearisation", "Multipliers", "linearise", "multipliers", "polish", "residual", "vjp"]
 
 
 def vjp(

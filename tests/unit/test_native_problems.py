@@ -117,6 +117,18 @@ def test_an_infeasible_plan_violates_as_little_as_can_be(solver):
     assert result.status.tolist() == [Status.INFEASIBLE]
     violation = problem.violation(result.primal.x, result.primal.u)
     torch.testing.assert_close(violation, torch.tensor([7.0]).double(), rtol=0, atol=1e-6)
+    small = {name: 1e-8 * getattr(problem, name) for name in ("u_min", "u_max", "g")}
+    assert BATCHED.solve(replace(problem, **small), None).status.tolist() == [Status.INFEASIBLE]
+
+
+def test_small_actions_meet_their_limits_where_the_cost_is_linear():
+    """With x₊ = x + 1e6 u, |u| ≤ 1e-6 and x + 1e6 u ≥ 1.5 after a step, the least sum of four states is 2.5."""
+    problem = one_state_from(0.0, growth=1.0, stage=1, least=1.5)
+    linear = {name: 0 * getattr(problem, name) for name in ("Q", "R", "Q_final")}
+    linear |= {name: 1 + getattr(problem, name) for name in ("q", "q_final")}
+    small = {name: 1e-6 * getattr(problem, name) for name in ("u_min", "u_max")}
+    result = BATCHED.solve(replace(problem, B=1e6 * problem.B, G_u=problem.G_u - 1e6, **linear, **small), None)
+    assert (result.status.item(), round(result.objective.item(), 9)) == (Status.CONVERGED, 2.5)
 
 
 def test_a_violation_is_measured_by_the_stages_where_the_row_counts():

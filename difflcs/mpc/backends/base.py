@@ -11,7 +11,7 @@ from torch import Tensor
 
 from difflcs._checks import did_you_mean
 from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError
-from difflcs.mpc import kkt
+from difflcs.mpc import conditions, kkt
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status, all_converged, solved
@@ -111,8 +111,8 @@ def certify(
     So an INFEASIBLE element keeps the plan that its solver ended with.
     """
     status = status.clone()
-    primal = kkt.complete(problem, primal)
-    primal = primal._replace(u=problem.clip(primal.u), mu=kkt.within_prices(problem, primal.mu))
+    primal = conditions.complete(problem, primal)
+    primal = primal._replace(u=problem.clip(primal.u), mu=conditions.within_prices(problem, primal.mu))
     finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
     status[~finite & (status == Status.CONVERGED)] = Status.NUMERICAL
     primal = replace_failed(problem, primal, status != Status.CONVERGED)
@@ -126,7 +126,7 @@ def certify(
 
 def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
     """Give failed (batch,) elements finite numbers: actions clipped into the bounds, and the trajectory they cause."""
-    primal, index = kkt.complete(problem, primal), torch.nonzero(failed).squeeze(-1)
+    primal, index = conditions.complete(problem, primal), torch.nonzero(failed).squeeze(-1)
     if not len(index):
         return primal
     part = problem.select(index)

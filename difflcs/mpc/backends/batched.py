@@ -10,7 +10,7 @@ from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_threads, make_plain
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-from difflcs.mpc import kkt
+from difflcs.mpc import conditions, kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem, array
 from difflcs.mpc.solution import Primal
@@ -234,20 +234,28 @@ class BatchedBackend(Backend):
         refused = torch.nonzero(status == int(Status.INFEASIBLE)).squeeze(-1)
         if len(refused):
             part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
-            sure = kkt.certainly_missed(part, plans)
+            sure = conditions.certainly_missed(part, plans)
             if bool(torch.isinf(part.price).any()):  # else this is the solve for the least violations, which can be met
-                sure &= self._impossible(part, started)
+                sure &= self._impossible(part, plans, started)
             status[refused[~sure]] = int(Status.NUMERICAL)
 
-    def _impossible(self, problem: MPCProblem, started: float) -> Tensor:
+    def _impossible(self, problem: MPCProblem, plans: Primal, started: float) -> Tensor:
         """Return which elements (batch,) miss a hard constraint at any cost, by a solve for the least violations."""
+        # In the units of their rows along the plans, and with actions as large as the states there.
         left = None if self.time_limit is None else max(1e-4, self.time_limit - (time.perf_counter() - started))
-        cost = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "S", "Q_final", "q", "r", "q_final")}
-        cost["price"] = torch.where(torch.isinf(problem.price), 1.0, 1e-6)
+        unit, width = conditions.row_units(problem, plans), conditions.ranges(problem, plans.u).amax(1)
+        unit, width, size = (torch.where(v > 0, v, 1.0)[:, None] for v in (unit, width, plans.x.abs().amax((1, 2))))
+        action, weight = width / size[..., None], torch.eye(problem.n_u, dtype=torch.float64) / size[..., None] ** 2
+        easy = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "S", "Q_final", "q", "r", "q_final")}
+        easy["price"] = torch.where(torch.isinf(conditions.prices(problem)), 1.0, 1e-6) / unit
+        for name in ("B", "E", "G_u", "u_min", "u_max"):
+            by = 1 / action if name in ("u_min", "u_max") else action.unsqueeze(-2)
+            easy[name] = (problem.batch_first(name) * by).expand(problem.batch, problem.horizon, *problem.shape(name))
         missed = torch.ones(problem.batch, dtype=torch.bool)
         known = ~missed
-        for weight in _FLAT:
-            cost["R"] = weight * torch.eye(problem.n_u, dtype=torch.float64).expand(problem.R.shape)
-            nearest = replace(self, time_limit=left).solve(replace(problem, **cost, barrier=0.0), None)
-            missed, known = missed & kkt.certainly_missed(problem, nearest.primal), known | solved(nearest.status)
+        for part in _FLAT:
+            easy["R"] = part * weight
+            nearest = replace(self, time_limit=left).solve(replace(problem, **easy, barrier=0.0), None)
+            plan = nearest.primal._replace(u=nearest.primal.u * action)
+            missed, known = missed & conditions.certainly_missed(problem, plan), known | solved(nearest.status)
         return missed & known

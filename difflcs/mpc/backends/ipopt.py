@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from difflcs._checks import check_number, check_positive_int, check_threads, make_plain
-from difflcs.mpc import kkt
+from difflcs.mpc import conditions, kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
@@ -138,7 +138,7 @@ class IpoptBackend(Backend):
             torch.cat([problem.x0.unsqueeze(1), x], 1),
             u,
             lam,
-            kkt.within_prices(problem, mu),
+            conditions.within_prices(problem, mu),
             torch.tensor(words, dtype=torch.int8),
             torch.from_numpy(solved.iterations),
             torch.from_numpy(solved.seconds),
@@ -155,7 +155,7 @@ class IpoptBackend(Backend):
         u = problem.clip(torch.nan_to_num(run.u, posinf=0.0, neginf=0.0))
         x, lam = problem.rollout(u)
         plan = Primal(x, u, lam, problem.no_multipliers())
-        excess = kkt.excess(problem, plan)
+        excess = conditions.excess(problem, plan)
         sure = run.status == Status.CONVERGED
         spent = failed.iterations + run.iterations, failed.seconds + run.seconds
         status = torch.where(sure & (excess > self.residual_tol), int(Status.INFEASIBLE), failed.status)
@@ -200,7 +200,7 @@ class IpoptBackend(Backend):
             x, lam = problem.rollout(u)
             s = problem.relaxation / lam.clamp_min(1e-300)
         u_min, u_max = (v.expand(batch, horizon, problem.n_u) for v in problem.bounds())
-        hard = torch.isinf(kkt.prices(problem))
+        hard = torch.isinf(conditions.prices(problem))
         c = problem.constraints(x, u)
         none = torch.isinf(c) if not elastic else torch.isinf(c) | ~hard
         row_max, v_max = (torch.where(v, torch.inf, torch.zeros_like(c)) for v in (none, hard if elastic else ~hard))
