@@ -39,7 +39,8 @@ from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.physics.mujoco import ContactGroup, Effort, MujocoCost, MujocoLCS, Orientation, Position
+from difflcs.physics.mujoco import Effort, MujocoCost, Orientation, Position
+from difflcs_envs.tasks import hand_system
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 from recorded import Recorded
@@ -65,7 +66,8 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
     "water_bottle": ((-0.02, 0.0), 0.06, (0.0, 0.0, 0.06)),
 }
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
-FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
+LINKS = "base", "proximal", "medial", "distal", "tip"
+FINGERS = [[f"{finger}_{link}" for link in LINKS] for finger in ("ff", "mf", "rf", "th")]
 COLUMNS = "object", "seed", "success", "placed", "dropped", "steps", "position_mm", "angle_deg", "goals"
 PARTS = "plan", "rehearsal"
 LONG = 0.12  # length from which on an object does not turn on the palm without touching the base of the thumb [m]
@@ -177,22 +179,9 @@ class HandPolicy:
         model.body_inertia[model.body("obj").id] *= s.inertia
         mujoco.mj_setConst(model, mujoco.MjData(model))  # simple bodies have it twice
         self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
-        self.module = MujocoLCS(
-            model,
-            data,
-            motion="quasi-dynamic",
-            torsion=False,  # the settings were chosen without it
-            contacts=[
-                ContactGroup(("obj", "palm"), 3),
-                *(ContactGroup([("obj", f"{f}_{link}") for link in LINKS], 2) for f in FINGERS),
-                ContactGroup(None, 4, friction=False, distance=0.006),
-            ],
-            distance=0.03,
-            friction=s.friction,
-            compliance=s.compliance,
-            length=0.02,
-            limits=0,  # actions are within them already
-        )
+        self.module = hand_system(
+            model, object="obj", fingers=FINGERS, data=data, friction=s.friction, compliance=s.compliance, limits=0
+        )  # no limits, as actions are within them already
         cost = MujocoCost(
             self.module,
             [
@@ -204,7 +193,7 @@ class HandPolicy:
         )
         solver, far = BatchedBackend(restarts=1, threads=1), s.pace * self.limit
         self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
-        self.settings, self.times = settings, []
+        self.settings = settings
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
         self.geom, self.spots = model.geom("obj").id, np.zeros((4, 3))
         self.aim(goal)
@@ -234,15 +223,11 @@ class HandPolicy:
             self.spots = self.random.uniform(-1, 1, (4, 3)) * size
         return self.waited < 0
 
-    def act(self, data: Any) -> np.ndarray:
-        """MuJoCo's ctrl for the next 0.1 s."""
+    def plan(self, data: Any) -> np.ndarray:
+        """Return by how much to move the targets of the servos from the joints [rad]."""
         if self.stalls(data):
             self.mpc.reset()
-            last, ctrl = self.ctrl, self.rehearse(data, self.posture - data.qpos[:16], (1.0,))
-            if ctrl is last:  # to open in this way does harm
-                self.posture = JOINTS + 0.3 * self.random.randn(16)
-            return ctrl
-        marks = [time.thread_time()]
+            return self.posture - data.qpos[:16]
         x, here = self.module.observe(data), data.qpos[-7:-4]
         grips = data.geom_xpos[self.geom] + self.spots @ data.geom_xmat[self.geom].reshape(3, 3).T
         grips[3] = here - [self.settings.behind, 0.0, 0.0]  # the thumb's
@@ -252,12 +237,7 @@ class HandPolicy:
         off = self.aimed - here
         beyond = off * min(1 + off @ off / self.settings.wide**2, 6.0)  # has the slope of the cost in `miss`
         goal = np.concatenate([here + beyond, self.goal, *grips])
-        action = self.mpc.step(x, goal, **bounds)  # which asks module and cost
-        marks.append(time.thread_time())
-        ctrl = self.rehearse(data, action, self.settings.paces)
-        marks.append(time.thread_time())
-        self.times.append(1e3 * np.diff(marks))
-        return ctrl
+        return self.mpc.step(x, goal, **bounds)  # which asks module and cost
 
     def lay_flat(self, data: Any, x: torch.Tensor) -> dict[str, torch.Tensor]:
         """Bounds of the actions by which the finger lies down into which the end of the object turns."""
@@ -269,10 +249,10 @@ class HandPolicy:
         low[finger], high[finger] = move - 1e-3, move + 1e-3
         return {"u_min": low, "u_max": high}
 
-    def rehearse(self, data: Any, action: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
-        """Try a step at two paces in MuJoCo: the faster if it ends about as well as the slower, or none."""
+    def rehearse(self, data: Any, action: np.ndarray) -> np.ndarray:
+        """MuJoCo's ctrl for the next 0.1 s: a step at the faster pace if it ends about as well, or none."""
         s, now, tries, ends = self.settings, self.miss(data), [], []
-        for pace in paces or (1.0,):
+        for pace in s.paces if s.paces and self.waited >= 0 else (1.0,):
             tries.append(data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit))
             safe = not s.paces or (ends != [] and now + s.slack < ends[-1] < now + s.worse)  # mostly better than it
             ends.append(now if safe else self.simulate(data, tries[-1]))
@@ -281,7 +261,9 @@ class HandPolicy:
         if min(ends) > now + s.worse:
             tries.append(self.ctrl)
             ends.append(self.simulate(data, self.ctrl))
-        self.ctrl = next(tried for tried, end in zip(tries, ends, strict=True) if end <= min(ends) + s.slack)
+        last, self.ctrl = self.ctrl, next(t for t, end in zip(tries, ends, strict=True) if end <= min(ends) + s.slack)
+        if self.ctrl is last and self.waited < 0:  # to open in this way does harm
+            self.posture = JOINTS + 0.3 * self.random.randn(16)
         return self.ctrl
 
     def simulate(self, data: Any, ctrl: np.ndarray) -> float:
@@ -309,9 +291,14 @@ def play(o: Options, name: str, seed: int) -> dict[str, Any]:
         goal = next_goal(random, o.axes, goal, data.qpos[-4:])
     limit = LIMIT if o.seconds is None else round(o.seconds / SECONDS)
     policy, held, goals, lost, steps = HandPolicy(model, data, place, goal, o.settings), np.zeros(2), 0, False, 0
-    turned = None  # after so many decisions
+    turned, times = None, []  # after so many decisions; milliseconds
     while (goals == 0 or o.seconds is not None) and not lost and steps < limit:
-        data.ctrl[:] = policy.act(data)
+        marks = [time.thread_time()]
+        action = policy.plan(data)
+        marks.append(time.thread_time())
+        data.ctrl[:] = policy.rehearse(data, action)
+        if policy.waited >= 0:  # it does not open
+            times.append(1e3 * np.diff([*marks, time.thread_time()]))
         mujoco.mj_step(model, data, SUBSTEPS)
         wrong = 1 - float(data.qpos[-4:] @ goal) ** 2
         apart = float(np.linalg.norm(data.qpos[-7:-4] - place))
@@ -333,8 +320,8 @@ def play(o: Options, name: str, seed: int) -> dict[str, Any]:
         "steps": turned or steps,
         "position_mm": 1e3 * apart,
         "angle_deg": 2 * np.degrees(np.arcsin(np.sqrt(np.clip(wrong, 0, 1)))),
-        "milliseconds": np.mean(policy.times, 0).tolist(),
-        "all_milliseconds": np.round(np.sum(policy.times, 1), 2).tolist(),
+        "milliseconds": np.mean(times, 0).tolist(),
+        "all_milliseconds": np.round(np.sum(times, 1), 2).tolist(),
     }
 
 

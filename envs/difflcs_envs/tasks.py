@@ -215,27 +215,34 @@ def trifinger_task(
     )
 
 
-def hand_system(model: Any, learn: Sequence[str | tuple[str, str]] = ()) -> Any:
-    """Make the system of the hand: at rest after each step, its servos give way, and each finger has contacts to spare.
+def hand_system(
+    model: Any, learn: Sequence[str | tuple[str, str]] = (), object: str = "object", fingers: Any = (), **options: Any
+) -> Any:
+    """Make the system of a hand: at rest after each step, its servos give way, and each finger has contacts to spare.
 
     Args:
-        model: MuJoCo's model, `difflcs_envs.hand.model.build_model`.
+        model: MuJoCo's model, such as `difflcs_envs.hand.model.build_model`.
         learn: What is uncertain in it, see `LearnableMujocoLCS`; nothing: a `MujocoLCS` as the model is.
+        object: The body in the hand.
+        fingers: The bodies of each finger; nothing: those of `build_model`.
+        options: Further ones of `MujocoLCS`, or in place of those here.
     """
     from difflcs.physics.mujoco import ContactGroup, LearnableMujocoLCS, MujocoLCS
     from difflcs_envs.hand.model import FINGERS, LINKS
 
-    options: dict[str, Any] = {
+    fingers = fingers or [[f"{finger}_{link}" for link in LINKS] for finger in FINGERS]
+    options = {
         "motion": "quasi-dynamic",
         "contacts": [
-            ContactGroup(("object", "palm"), 3),
-            *(ContactGroup([("object", f"{finger}_{link}") for link in LINKS], 2) for finger in FINGERS),
+            ContactGroup((object, "palm"), 3),
+            *(ContactGroup([(object, link) for link in finger], 2) for finger in fingers),
             ContactGroup(None, 4, friction=False, distance=0.006),  # fingers with each other
         ],
         "distance": 0.03,
         "torsion": False,
         "compliance": 0.1,
         "length": 0.02,
+        **options,
     }
     return LearnableMujocoLCS(model, learn=learn, **options) if learn else MujocoLCS(model, **options)
 

@@ -9,7 +9,7 @@ import torch
 import difflcs_envs  # noqa: F401
 from difflcs.rl.tasks import get_task
 from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation
-from difflcs_envs.hand.model import OBJECTS, PALM_TOP
+from difflcs_envs.hand.model import FINGERS, LINKS, OBJECTS, PALM_TOP
 from difflcs_envs.hand.task import rotation_to_quaternion
 from difflcs_envs.tasks import hand_cost, hand_system
 
@@ -98,6 +98,11 @@ def test_the_system_predicts_open_joints_and_the_cost_is_zero_at_the_goal():
     x, u = system.observe(env.data), torch.full((16,), -0.05, dtype=torch.float64)
     u[[0, 4, 8, 12]] = 0.02
     predicted = system.params(x).step(x, u).x_next
+    fingers = [[f"{finger}_{link}" for link in LINKS] for finger in FINGERS]
+    named = hand_system(env.model, object="object", fingers=fingers, compliance=0.2)
+    assert torch.equal(named.params(x).E, system.params(x).E)
+    assert hand_system(env.model, fingers=fingers[:2]).params(x).n_lam < named.params(x).n_lam == system.params(x).n_lam
+    assert named.compliance == 0.2
     after, *_ = env.step(u.numpy())
     assert np.abs(predicted[:16].numpy() - after["state"][:16]).max() < 0.01
     pose = np.concatenate([observation["state"][16:19], rotation_to_quaternion(observation["state"][19:])])
