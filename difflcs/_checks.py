@@ -2,10 +2,11 @@
 
 import difflib
 import functools
+import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import ParamSpec, TypeGuard, TypeVar
+from typing import Any, ParamSpec, TypeGuard, TypeVar
 
 import numpy as np
 import torch
@@ -58,14 +59,14 @@ def to_tensor(value: object) -> object:
 
 
 def check_array(name: str, value: object) -> np.ndarray:
-    """Convert real numbers, also in a tensor or in lists, to a float64 array; NaN and infinity are allowed."""
+    """Copy real numbers, also in a tensor or in lists, to a float64 array; NaN and infinity are allowed."""
     try:
         array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
     except (TypeError, ValueError, RuntimeError) as error:  # ragged, or a tensor without numbers
         raise DTypeError(f"{name}: expected numbers, got {describe(value)}; pass a NumPy array of floats") from error
     if array.dtype.kind not in "fiu":
         raise DTypeError(f"{name}: expected real numbers, got {describe(value)}; pass a NumPy array of floats")
-    return array.astype(np.float64, copy=False)
+    return np.array(array, np.float64)  # torch takes no others that are read-only or backwards
 
 
 def takes_arrays(function: Callable[P, R]) -> Callable[P, R]:
@@ -126,9 +127,53 @@ def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> Non
     """Check the trailing dimensions of a tensor, as a part of `check_tensor`."""
     if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        raise ShapeError(
-            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
-        )
+        raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it, or rebuild it")
+
+
+def check_shape(
+    name: str, value: object, shape: str, sizes: Mapping[str, object] | None = None, remedy: str = "reshape it"
+) -> Tensor:
+    """Check one floating-point tensor and its shape, written as in docstrings: "... n_x", "n 2"; "5+" is 5 or more.
+
+    `sizes` are those of names; a name that is not among them is any size.
+    """
+    tensor, batched = check_tensor(name, value), shape.startswith("...")
+    words = shape.split()[batched:]
+    dims = [str((sizes or {}).get(word, word)) for word in words]
+    got = tensor.shape[max(tensor.ndim - len(dims), 0) :]
+    fits = len(got) == (len(dims) if batched else tensor.ndim) == len(dims)
+    for dim, size in zip(dims, got, strict=False):
+        least = size if dim.isidentifier() else int(dim.rstrip("+"))
+        fits = fits and (size >= least if dim.endswith("+") else size == least)
+    if not fits:
+        labels = (dim if dim == word else f"{word}={dim}" for word, dim in zip(words, dims, strict=True))
+        wanted = "..., " * batched + ", ".join(labels) + "," * (len(dims) == 1 and not batched)
+        raise ShapeError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}; {remedy}")
+    return tensor
+
+
+def takes(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Make a method check the tensors that it takes, see `check_shape`, and get them in float64 on the CPU.
+
+    Names of sizes are those of attributes, which may also say the least, as in "5+".
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+            given = signature.bind(*args, **kwargs)
+            for name in shapes.keys() & given.arguments.keys():
+                sizes = {dim: size for dim in shapes[name].split() if (size := getattr(args[0], dim, None)) is not None}
+                given.arguments[name] = check_shape(name, given.arguments[name], shapes[name], sizes).to(
+                    "cpu", torch.float64
+                )
+            return function(*given.args, **given.kwargs)
+
+        return wrapper
+
+    return decorate
 
 
 def is_array(value: object) -> TypeGuard[Tensor]:
@@ -165,6 +210,13 @@ def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], re
         wanted = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
         raise DTypeError(f"{name}: expected {wanted}, got {describe(value)}; {remedy}")
     return value
+
+
+def check_list(name: str, value: Any, remedy: str, kind: Any = object) -> list[Any]:
+    """Make a list of objects of a class; refuse a word, a tensor, and what cannot be counted up."""
+    if isinstance(value, str | bytes | Tensor) or not isinstance(value, Iterable):
+        raise DTypeError(f"{name}: expected a list, got {describe(value)}; {remedy}")
+    return [check_kind(f"{name}[{i}]", one, kind, remedy) for i, one in enumerate(value)]
 
 
 def check_finite(tensors: Mapping[str, Tensor]) -> None:

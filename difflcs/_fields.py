@@ -45,9 +45,7 @@ def check_by_stage(by_stage: Collection[str], names: Iterable[str], present: Ite
         raise DTypeError(f"by_stage: expected a tuple of names like {names[:2]}, got {describe(by_stage)}; add a comma")
     for name in by_stage:
         if name not in names:
-            raise InvalidInputError(
-                f"by_stage: expected names among {', '.join(names)}, got {describe(name)}; leave it out"
-            )
+            raise InvalidInputError(f"by_stage: expected some of {', '.join(names)}, got {describe(name)}; omit it")
     staged = frozenset(by_stage) & frozenset(present)
     if not staged:
         raise InvalidInputError(

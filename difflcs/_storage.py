@@ -102,9 +102,7 @@ def read_bytes(path: Path) -> bytes:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise CheckpointError(
-            f"{path}: expected a file that can be read, got {error}; restore it from a copy"
-        ) from error
+        raise CheckpointError(f"{path}: expected a readable file, got {error}; restore it from a copy") from error
 
 
 def read_json(path: Path) -> object:
@@ -159,9 +157,7 @@ def _check_size(path: Path, limit: int) -> None:
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}: expected a file that can be read, got {error}; restore it from a copy"
-        ) from error
+        raise CheckpointError(f"{path}: expected a readable file, got {error}; restore it from a copy") from error
     if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: expected a plain file, got another kind; restore it from a copy")
     if status.st_size > limit:
@@ -184,9 +180,7 @@ def locked(directory: Path) -> Iterator[None]:
     try:
         import filelock
     except ImportError as error:
-        raise MissingDependencyError(
-            'expected the package filelock, not installed; run: pip install "difflcs[rl]"'
-        ) from error
+        raise MissingDependencyError('expected package filelock, got none; run: pip install "difflcs[rl]"') from error
     path = directory / LOCK
     lock = filelock.FileLock(path)
     try:

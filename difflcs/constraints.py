@@ -5,10 +5,10 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, plain, takes_arrays
+from difflcs._checks import broadcast_batch, check_same_device, check_shape, describe, plain, takes_arrays
 from difflcs._differentiation import is_wrapped
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
-from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import BoundsError, DTypeError, InvalidInputError
 
 _DIMENSIONS = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
@@ -106,19 +106,14 @@ class _Constraints(TensorFields):
     weight: Tensor | None
 
     def _fill(self, G: Tensor, g: Tensor, E: Tensor | None, weight: Tensor | float | None) -> None:
-        check_tensor("G", G)
-        if G.ndim < 2:
-            raise ShapeError(f"G: expected a matrix (..., n_c, n_x), got {describe(G)}; pass one row per constraint")
+        each = "pass one row per constraint"
+        check_shape("G", G, "... n_c n_x", remedy=each)
         self.n_c, self.n_x = G.shape[-2:]
         rows = ("n_c", self.n_c)
         fields = {"G": G, "g": check_not_nan("g", g, [rows])}
         self.n_u = None
         if E is not None:
-            check_tensor("E", E)
-            if E.ndim < 2 or E.shape[-2] != self.n_c:
-                raise ShapeError(
-                    f"E: expected a matrix (..., n_c={self.n_c}, n_u), got {describe(E)}; pass one row per constraint"
-                )
+            check_shape("E", E, "... n_c n_u", {"n_c": self.n_c}, each)
             fields["E"], self.n_u = E, E.shape[-1]
         if weight is not None:
             fields["weight"] = as_bound("weight", weight, [rows], G)

@@ -15,6 +15,7 @@ from difflcs._checks import (
     check_number,
     check_positive_int,
     check_same_device,
+    check_shape,
     check_tensor,
     describe,
     takes_arrays,
@@ -59,9 +60,7 @@ class _Quadratic(TensorFields):
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
             if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-                raise ShapeError(
-                    f"{name}: expected a square matrix (..., n, n), got {describe(value)}; pass the weight matrix"
-                )
+                raise ShapeError(f"{name}: expected a square matrix (..., n, n), got {describe(value)}; pass one")
         self.n_x, self.n_u = Q.shape[-1], R.shape[-1]
         fields = {
             "Q": Q,
@@ -312,9 +311,7 @@ class GoalCost(TensorFields):
         super().__init__()
         QuadraticCost(Q.detach(), R.detach(), Q_final.detach())
         self.n_x, self.n_u = Q.shape[-1], R.shape[-1]
-        check_tensor("goal_to_q", goal_to_q)
-        if goal_to_q.ndim != 2:
-            raise ShapeError(f"goal_to_q: expected (n_x={self.n_x}, n_goal), got {describe(goal_to_q)}")
+        check_shape("goal_to_q", goal_to_q, "n_x n_goal", {"n_x": self.n_x})
         self.n_goal = goal_to_q.shape[-1]
         square = goal_to_q.new_zeros(self.n_goal, self.n_goal)
         fields = {

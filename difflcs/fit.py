@@ -17,6 +17,7 @@ from difflcs._checks import (
     check_dims,
     check_number,
     check_positive_int,
+    check_shape,
     check_tensor,
     describe,
     takes_arrays,
@@ -70,9 +71,7 @@ class Transitions(NamedTuple):
                 for name, value in (("states", states), ("actions", actions))
             ]
             if len(each[0]) != len(each[1]):
-                raise ShapeError(
-                    f"actions: expected {len(each[0])} episodes like the states, got {len(each[1])}; pair them"
-                )
+                raise ShapeError(f"actions: expected {len(each[0])} episodes, got {len(each[1])}; pair with states")
             pairs = list(zip(*each, strict=True))
         else:
             s, u, number = _rows("states", states), _rows("actions", actions), np.asarray(episode)
@@ -266,9 +265,7 @@ def fit_report(
 def _rows(name: str, value: Any) -> Tensor:
     """Convert rows of numbers to a finite matrix in float64."""
     rows = value.detach().double() if isinstance(value, Tensor) else torch.from_numpy(check_array(name, value))
-    if rows.ndim != 2:
-        raise ShapeError(f"{name}: expected rows (T, n), got shape {tuple(rows.shape)}; give one row for each step")
-    return check_tensor(name, rows)
+    return check_shape(name, rows, "T n", remedy="give one row for each step")
 
 
 def _continues(x: Tensor, x_next: Tensor) -> Tensor:

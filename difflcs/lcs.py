@@ -17,7 +17,7 @@ from difflcs._checks import (
     check_kind,
     check_number,
     check_positive_int,
-    check_tensor,
+    check_shape,
     takes_arrays,
 )
 from difflcs._differentiation import runs_eagerly, transforms_active
@@ -26,18 +26,14 @@ from difflcs._modules import fresh, plain_state, untouched
 from difflcs._recall import Recall
 from difflcs.constraints import check_bounds
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
-from difflcs.records import SYSTEM, LCSParams, LCSPrediction, advance, check_inputs, check_sequence
+from difflcs.records import SYSTEM, LCSParams, LCSPrediction, advance, check_inputs
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def _check_support(support: object, n_u: int) -> Tensor:
     """Check lower and upper bounds (2, n_u) of actions."""
-    support = check_tensor("action_support", support, [("2", 2), ("n_u", n_u)])
-    if support.ndim != 2:
-        raise ShapeError(
-            f"action_support: expected shape (2, {n_u}), got {tuple(support.shape)}; it is that of a model"
-        )
+    support = check_shape("action_support", support, f"2 {n_u}")
     check_bounds(support[0], support[1])
     return support.detach()
 
@@ -78,7 +74,7 @@ class PredictiveModule(nn.Module):
         Returns:
             (..., T+1, n_x) states, x0 first.
         """
-        check_sequence(self.n_u, u_seq)
+        check_shape("u_seq", u_seq, "... T n_u", {"n_u": self.n_u}, "add a dimension of steps")
         self.check_inputs(x0=x0, u_seq=u_seq)
         batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
         states = [x0.expand(*batch, self.n_x)]

@@ -14,8 +14,10 @@ from difflcs._checks import (
     check_dims,
     check_finite,
     check_integer,
+    check_kind,
     check_positive_definite,
     check_same_device,
+    check_shape,
     check_tensor,
     describe,
     describe_shapes,
@@ -109,9 +111,7 @@ class _Record(SystemMatrices):
             if tensors[name].ndim < rank + len(dims):
                 labels = ", ".join(("...", *self._STAGES, *(("rows", "columns") if len(dims) == 2 else dims)))
                 kind = "a matrix" if len(dims) == 2 else "a vector"
-                raise ShapeError(
-                    f"{name}: expected {kind} ({labels}), got {describe(tensors[name])}; add the missing dimensions"
-                )
+                raise ShapeError(f"{name}: expected {kind} ({labels}), got {describe(tensors[name])}; add the missing")
         sizes = {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam")}
         stages = [("H", self.A.shape[-3])] if rank else []
         if stages and not stages[0][1]:
@@ -218,8 +218,9 @@ class _Record(SystemMatrices):
     def _fits(self, **batches: torch.Size) -> torch.Size:
         return broadcast_batch([("the system", self.batch_shape), *batches.items()])
 
-    def _check_rollout(self, x0: Tensor, u_seq: Tensor) -> torch.Size:
-        check_sequence(self.n_u, u_seq)
+    def _check_rollout(self, x0: Tensor, u_seq: Tensor, horizon: int | None = None) -> torch.Size:
+        sizes = {"n_u": self.n_u} if horizon is None else {"n_u": self.n_u, "T": horizon}
+        check_shape("u_seq", u_seq, "... T n_u", sizes, "give one action for each step")
         self.check_inputs(x0=x0, u_seq=u_seq)
         return self._fits(x0=x0.shape[:-1], u_seq=u_seq.shape[:-2])
 
@@ -361,12 +362,7 @@ class LCSSequence(_Record):
         Returns:
             (..., H+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
         """
-        batch = self._check_rollout(x0, u_seq)
-        if u_seq.shape[-2] != self.horizon:
-            raise ShapeError(
-                f"u_seq: expected shape (..., H={self.horizon}, n_u={self.n_u}), got {tuple(u_seq.shape)}; give one "
-                f"action for each stage"
-            )
+        batch = self._check_rollout(x0, u_seq, self.horizon)
         states = [x0.expand(*batch, self.n_x)]
         for k in range(self.horizon):
             states.append(advance(self.stage(k), states[-1], u_seq[..., k, :]).x_next)
@@ -438,8 +434,9 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
     Raises:
         DTypeError: the module does not return `LCSParams`.
     """
-    u = plan.u.detach()
-    x = (plan.x[..., 0, :] if x0 is None else x0).expand(*u.shape[:-2], lcs.n_x)
+    lcs, u = check_kind("lcs", lcs, LCSModule), check_shape("plan.u", getattr(plan, "u", plan), "... H n_u").detach()
+    x0 = check_shape("x0", plan.x[..., 0, :] if x0 is None else x0, "... n_x", {"n_x": lcs.n_x})
+    x = x0.expand(*broadcast_batch([("plan.u", u.shape[:-2]), ("x0", x0.shape[:-1])]), lcs.n_x)
     context_along, systems = getattr(lcs, "context_along", None), []
     states_along = getattr(lcs, "states_along", None)
     if context_along is not None and states_along is not None and (states := states_along(x, u)) is not None:
@@ -474,12 +471,3 @@ def check_inputs(n_x: int, n_u: int, like: Tensor, tensors: Mapping[str, Tensor]
                 f"convert it with {name}.to({like.dtype}) or the {owner} with {owner}.to({tensor.dtype})"
             )
     check_same_device([(owner, like), *tensors.items()])
-
-
-def check_sequence(n_u: int, u_seq: Tensor) -> None:
-    """Check that a tensor is a sequence of actions."""
-    check_tensor("u_seq", u_seq, [("n_u", n_u)])
-    if u_seq.ndim < 2:
-        raise ShapeError(
-            f"u_seq: expected shape (..., T, n_u={n_u}), got {tuple(u_seq.shape)}; add a dimension of steps"
-        )

@@ -62,9 +62,7 @@ class Scales:
         for name in ("center", "state", "action"):
             value = check_tensor(name, to_tensor(getattr(self, name)))
             if value.ndim != 1 or (name == "state" and value.shape != self.center.shape):
-                raise ShapeError(
-                    f"{name}: expected a number for each state or action, got {describe(value)}; see Scales"
-                )
+                raise ShapeError(f"{name}: expected a number for each state or action, got {describe(value)}; see help")
             if name != "center" and not bool((value > 0).all()):
                 raise InvalidInputError(f"{name}: expected units above 0, got {describe(value)}; 1 where none is known")
             vars(self)[name] = value
@@ -158,9 +156,7 @@ def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     action = torch.where(action > 0, action, torch.ones_like(action))
     step = float(((x_next - x) / state).square().mean(0).sqrt().max())
     if step == 0:
-        raise InvalidInputError(
-            "x_next: expected states that change, got x itself; give transitions of a moving system"
-        )
+        raise InvalidInputError("x_next: expected states that change, got x itself; give those of a moving system")
     return Scales(center, state, action, _XI, _RELAXATION * step * step)
 
 

@@ -14,11 +14,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from difflcs import GoalCost, LCSModel, LCSParams, QuadraticCost
+from difflcs import DiffLCSError, GoalCost, LCSModel, LCSParams, QuadraticCost
 
 # Threads cost more than they bring on problems as small as those of the tests; it is the number of the kernels', too.
 # Tests about threads say themselves how many they want.
 torch.set_num_threads(1)
+
+
+def refuse(error, match: str, function: Callable, *args, **kwargs) -> str:
+    """Check that a call raises an error of the library that matches, and return its message."""
+    with pytest.raises(error, match=match) as caught:
+        function(*args, **kwargs)
+    assert isinstance(caught.value, DiffLCSError)
+    return str(caught.value)
 
 
 class Build:

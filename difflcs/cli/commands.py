@@ -170,9 +170,7 @@ def _parse(words: Sequence[str]) -> Any:
 
     if words and not words[0].startswith("-") and words[0] not in _COMMANDS:
         near = did_you_mean(words[0], _COMMANDS)
-        raise InvalidInputError(
-            f"command: expected one of {', '.join(_COMMANDS)}, got {words[0]!r}{near}; see difflcs --help"
-        )
+        raise InvalidInputError(f"command: expected one of {', '.join(_COMMANDS)}, got {words[0]!r}{near}; see --help")
     # `train` has settings for which None means something.
     plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
     if words[:1] == ["train"]:

@@ -63,9 +63,7 @@ class Train(TrainConfig):
                     f"{value!r}; drop the flag, or start another run with another --out"
                 )
         if self.init is not None:
-            raise CheckpointError(
-                "--init: expected it without --resume; a resumed run continues from its own checkpoint"
-            )
+            raise CheckpointError("--init: expected it without --resume; a resumed run goes on from its own checkpoint")
         return stored
 
     def interrupted(self) -> str:

@@ -28,10 +28,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
+from difflcs._checks import (
+    broadcast_batch,
+    check_array,
+    check_choice,
+    check_kind,
+    check_number,
+    check_shape,
+    check_tensor,
+    describe,
+)
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
-from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
 Cone = Literal["anitescu", "stewart-trinkle"]
@@ -126,9 +135,7 @@ def given_states(x: Tensor | None) -> Tensor:
         InvalidInputError: no states.
     """
     if x is None:
-        raise InvalidInputError(
-            "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
-        )
+        raise InvalidInputError("x: expected states (..., n_x), as contacts depend on them, got None; pass x")
     return x
 
 
@@ -189,12 +196,13 @@ def contact_lcs(
     check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
     length = check_number("length", length, strict=True)
     force = length if force is None else check_number("force", force, strict=True)
-    n_x, n_contacts, n_tangents = x.shape[-1], contacts.gap.shape[-1], contacts.tangent.shape[-2]
-    _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
-    _check_more(unilateral, bounded, n_x)
+    _check(x, contacts, free, unilateral, bounded)
+    n_contacts, n_tangents = contacts.tangent.shape[-3:-1]
     mu = _per_row("friction", friction, contacts.gap, strict=False)
-    others = sum(m[0].shape[-1] for m in (unilateral, bounded) if m is not None)
-    of_all = contacts.gap.new_empty(n_contacts + others)
+    others = [0 if m is None else m[0].shape[-1] for m in (unilateral, bounded)]
+    if rest is not None:
+        check_shape("rest", rest, "... n_lam", {"n_lam": count_forces(n_contacts, n_tangents, cone, *others)})
+    of_all = contacts.gap.new_empty(n_contacts + sum(others))
     soft = _per_row("compliance", compliance, of_all, strict=True) * (force / length)
     return LCSParams(**assemble_lcs(contacts, free, x, mu, soft, cone, length, force, rest, unilateral, bounded))
 
@@ -304,29 +312,31 @@ def _repeat(values: Any, times: int, dim: int) -> Any:
     return values.repeat_interleave(times, dim) if isinstance(values, Tensor) else values.repeat(times, dim)
 
 
-def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
-    of_contacts, of_state = ("n_contacts", n_contacts), ("n_x", n_x)
-    check_tensor("contacts.gap", contacts.gap)
-    check_tensor("contacts.normal", contacts.normal, [of_contacts, of_state])
-    check_tensor("contacts.tangent", contacts.tangent, [of_contacts, ("n_tangents", n_tangents), of_state])
-    if free.B.ndim < 2:
-        raise ShapeError(f"free.B: expected shape (..., n_x={n_x}, n_u), got {tuple(free.B.shape)}; add dimensions")
-    check_tensor("free.B", free.B, [of_state, ("n_u", free.B.shape[-1])])
-    for name in ("A", "response"):
-        check_tensor(f"free.{name}", getattr(free, name), [of_state, of_state])
-    check_tensor("free.d", free.d, [of_state])
+_SHAPES: dict[Any, str] = {
+    Contacts: "n_contacts, n_contacts n_x, n_contacts n_tangents n_x",
+    FreeMotion: "n_x n_x, n_x n_u, n_x, n_x n_x",
+    Unilateral: "n_unilateral, n_unilateral n_x, n_x n_unilateral",
+    Bounded: "n_bounded, n_bounded n_x, n_bounded, n_bounded, n_x n_bounded",
+}
 
 
-def _check_more(unilateral: Unilateral | None, bounded: Bounded | None, n_x: int) -> None:
-    """Check the rows that are no contacts."""
-    for name, rows in (("unilateral", unilateral), ("bounded", bounded)):
-        if rows is None:
+def _check(x: Tensor, contacts: Any, free: Any, unilateral: Any, bounded: Any) -> None:
+    """Check the states and the records of `contact_lcs`."""
+    n_x, batches = check_shape("x", x, "... n_x").shape[-1], [("x", x.shape[:-1])]
+    given = {"contacts": contacts, "free": free, "unilateral": unilateral, "bounded": bounded}
+    for (of, record), (kind, shapes) in zip(given.items(), _SHAPES.items(), strict=True):
+        if record is None and kind in (Unilateral, Bounded):
             continue
-        n, of_state = (f"n_{name}", rows[0].shape[-1]), ("n_x", n_x)
-        for field, value in zip(rows._fields, rows, strict=True):
-            if value is not None:
-                kinds = {"normal": [n, of_state], "slide": [n, of_state], "effect": [of_state, n]}
-                check_tensor(f"{name}.{field}", value, kinds.get(field, [n]))
+        sizes: dict[str, int] = {"n_x": n_x}
+        for field, value, shape in zip(kind._fields, check_kind(of, record, kind), shapes.split(", "), strict=True):
+            if value is None and field == "effect":
+                continue
+            value = check_shape(name := f"{of}.{field}", value, f"... {shape}", sizes)
+            if value.dtype != x.dtype:
+                raise DTypeError(f"{name}: expected {x.dtype} like x, got {describe(value)}; convert one of them")
+            sizes.setdefault(shape.split()[-1], value.shape[-1])
+            batches.append((name, value.shape[: value.ndim - len(shape.split())]))
+    broadcast_batch(batches)
     if bounded is not None and not is_wrapped(crossed := bounded.lower > bounded.upper) and bool(crossed.any()):
         raise InvalidInputError(
             "bounded.lower: expected at most the upper bound, got more; exchange them, or give both the same value"
@@ -335,7 +345,8 @@ def _check_more(unilateral: Unilateral | None, bounded: Bounded | None, n_x: int
 
 def _per_row(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
     """Expand a coefficient to one for each contact, or each row."""
-    value = torch.as_tensor(value, dtype=gap.dtype, device=gap.device)
+    value = value if isinstance(value, Tensor) else torch.from_numpy(check_array(name, value))
+    value = check_tensor(name, value, finite=False).to(gap)
     bad = value <= 0 if strict else value < 0
     if not is_wrapped(value) and (bool(bad.any()) or not bool(torch.isfinite(value).all())):
         limit = "above 0" if strict else "of at least 0"

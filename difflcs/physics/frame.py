@@ -6,7 +6,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_tensor
+from difflcs._checks import check_integer, check_kind, check_list, check_shape, check_tensor
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
@@ -79,10 +79,16 @@ class BodyFrameLCS(LCSModel):
             getattr(self, name).copy_(value)
         if frame is None:
             return
-        pairs = (frame.place, *frame.points)
-        states, inputs = [frame.yaw, *sum(pairs, ())], [*sum(frame.vectors, ())]
+        check_kind("frame", frame, Frame)
+        points, vectors = (
+            check_list(f"frame.{name}", getattr(frame, name), "give pairs of columns", tuple)
+            for name in Frame._fields[2:]
+        )
+        pairs = (check_kind("frame.place", frame.place, tuple, "give two columns"), *points)
+        states, inputs = [frame.yaw, *sum(pairs, ())], [*sum(vectors, ())]
         for used, size in ((states, self.n_x), (inputs, self.n_u)):
-            if len({*used} & {*range(size)}) < len(used):
+            apart = {check_integer("frame", column) for column in used} & {*range(size)}
+            if len(apart) < len(used) or any(len(pair) != 2 for pair in (*pairs, *vectors)):
                 raise InvalidInputError(f"frame: expected columns below {size}, each of them once, got {frame}")
         self.yaw[frame.yaw] = 1.0
         self.seen[states[:3]] = 0.0
@@ -110,11 +116,17 @@ class BodyFrameLCS(LCSModel):
             u: (N, n_u) actions.
             x_next: (N, n_x) next states.
         """
-        frame = find_frame(x, u, x_next)
+        frame = find_frame(*self._transitions(x=x, u=u, x_next=x_next))
         if frame is None or frame == self.frame:
             return False
         self._start(frame)
         return True
+
+    def _transitions(self, **given: Tensor) -> list[Tensor]:
+        """Check transitions (N, n_x), (N, n_u), (N, n_x), and convert them to the dtype of the parameters."""
+        N = check_shape("x", given["x"], "N n_x", {"n_x": self.n_x}).shape[0]
+        sizes, of = {"n_x": self.n_x, "n_u": self.n_u, "N": N}, {"u": "N n_u"}
+        return [check_shape(name, value, of.get(name, "N n_x"), sizes).to(self.A) for name, value in given.items()]
 
     @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
@@ -160,6 +172,7 @@ class BodyFrameLCS(LCSModel):
         Returns:
             The transitions in these units, standardised, as seen from the body, itself at the origin.
         """
+        x, u, x_next = self._transitions(x=x, u=u, x_next=x_next)
         with torch.no_grad():
             old, yaw = self._in_si(), x @ self.yaw
             back = _rotation(self.turn, yaw).mT

@@ -1,13 +1,13 @@
 """ContactLCS: contact physics whose numbers are learned."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_kind
+from difflcs._checks import check_kind, check_list
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
@@ -43,9 +43,9 @@ class ContactLCS(nn.Module):
     def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-2]):
         super().__init__()
         check_kind("physics", physics, PlanarPushing, "build one from shapes")
-        self.learn = tuple(learn) if isinstance(learn, Iterable) else (learn,)
+        self.learn = tuple(check_list("learn", learn, f"name some of {', '.join(LEARNABLE)}"))
         unknown = [name for name in self.learn if not isinstance(name, str) or name not in LEARNABLE]
-        if unknown or len(set(self.learn)) < len(self.learn) or isinstance(learn, str):
+        if unknown or len(set(self.learn)) < len(self.learn):
             raise InvalidInputError(
                 f"learn: expected some of {', '.join(LEARNABLE)}, each once, got {learn!r:.200}; name what is uncertain"
             )

@@ -32,6 +32,7 @@ from difflcs._checks import (
     check_number,
     check_positive_int,
     check_tensor,
+    describe,
 )
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs.errors import InvalidInputError, ShapeError
@@ -244,16 +245,13 @@ class PlanarPushing:
         check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
         defaults = [name for name in ("center_of_mass", "gyration", "length") if getattr(self, name) is None]
         vars(self)["defaults"] = dict.fromkeys(defaults)
-        values: dict[str, Any] = {name: self._of_discs(name, getattr(self, name)) for name in ("radius", "compliance")}
-        values["friction"] = 0.0 if self.frictionless else self._of_discs("friction", self.friction)
+        rough = () if self.frictionless else ("friction",)
+        values: dict[str, Any] = {name: self._of_discs(name, getattr(self, name)) for name in ("radius", *rough)}
+        values["compliance"] = self._of_discs("compliance", self.compliance, strict=True)
         center = self.shape.centroid if self.center_of_mass is None else self.center_of_mass
-        values["center_of_mass"] = _number("center_of_mass", center)
-        if values["center_of_mass"].shape != (2,):
-            got = tuple(values["center_of_mass"].shape)
-            raise ShapeError(f"center_of_mass: expected (2,), got {got}; give x and y in coordinates of the body")
-        values["gyration"] = _number("gyration", self._default_gyration() if self.gyration is None else self.gyration)
-        if values["gyration"].numel() != 1 or not float(values["gyration"].detach()) > 0:
-            raise InvalidInputError(f"gyration: expected a number above 0, got {self.gyration}; give it as a length")
+        values["center_of_mass"] = _number("center_of_mass", center, sizes=[(2,)])
+        gyration = self._default_gyration() if self.gyration is None else self.gyration
+        values["gyration"] = _number("gyration", gyration, 0.0, strict=True, sizes=[(), (1,)])
         length = float(values["gyration"].detach()) if self.length is None else self.length
         values["length"] = check_number("length", length, strict=True)
         for name, value in values.items():
@@ -264,18 +262,13 @@ class PlanarPushing:
         offset = _number("center_of_mass", centroid if self.center_of_mass is None else self.center_of_mass) - centroid
         return (polar / area + offset.square().sum()).sqrt()
 
-    def _of_discs(self, name: str, value: float | Tensor) -> Tensor:
-        number = _number(name, value)
-        if number.shape not in ((), (self.n_discs,)):
-            raise ShapeError(
-                f"{name}: expected a number or ({self.n_discs},), got {tuple(number.shape)}; give one for each disc"
-            )
-        return number.expand(self.n_discs)
+    def _of_discs(self, name: str, value: float | Tensor, strict: bool = False) -> Tensor:
+        return _number(name, value, 0.0, strict, [(), (self.n_discs,)]).expand(self.n_discs)
 
     @property
     def frictionless(self) -> bool:
         """True if each contact has one force, along the normal."""
-        return not isinstance(self.friction, Tensor) and self.friction == 0
+        return isinstance(self.friction, int | float) and self.friction == 0
 
     @property
     def n_x(self) -> int:
@@ -338,17 +331,18 @@ class PlanarPushing:
         if self.inertia is None:
             return None
         mass = float(_number("mass", self.inertia.mass, 0.0, True).detach())
-        return (self.length or 1.0) * mass / self.inertia.seconds
+        return (self.length or 1.0) * mass / float(self.inertia.seconds)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
+        check_tensor("x", x, [("n_x", self.n_x)])
         m, parts, batch = self.n_discs, self.parts_touched, x.shape[:-1]
         discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
         nearest = self.shape.distance(to_body(x, discs))
         if parts < self.shape.n_parts:
             kept = nearest.distance.detach().topk(parts, largest=False).indices
             nearest = Distance(*(_select(value, kept) for value in nearest))
-        gap = nearest.distance - self._of_discs("radius", self.radius).unsqueeze(-1)
+        gap = nearest.distance - torch.as_tensor(self.radius).unsqueeze(-1)
         cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
 
         def turn(v: Tensor) -> tuple[Tensor, Tensor]:
@@ -393,9 +387,13 @@ class PlanarPushing:
         m, n_x, h = self.n_discs, self.n_x, 0.0
         if self.inertia is not None:
             h = check_number("seconds", self.inertia.seconds, strict=True)
+            _number("mass", self.inertia.mass, 0.0, True, [(), (1,)])
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
         step, k = self.drive.step(), self.drive.order
+        for size in (step.A.shape[:-2], step.b.shape[:-1], step.response.shape[:-1]):
+            if size not in ((), (2,), (1, 2), (m, 1), (m, 2), (1, 1), (1,)):
+                raise ShapeError(f"drive: expected numbers, (2,), ({m}, 1) or ({m}, 2), got {tuple(size)}; give such")
         places = 3 + torch.arange(2 * m)
         of = [places + 2 * m * i for i in range(k)]  # positions, then velocities
         for i in range(k):
@@ -404,7 +402,7 @@ class PlanarPushing:
             B[of[i], torch.arange(2 * m)] = step.b[..., i].to(A).expand(m, 2).reshape(-1)
             response[of[i], places] = step.response[..., i].to(A).expand(m, 2).reshape(-1)
         if self.inertia is not None:
-            decay = torch.exp(-_number("damping", self.inertia.damping, 0.0).to(A) * h)
+            decay = torch.exp(-_number("damping", self.inertia.damping, 0.0, sizes=[(), (1,), (3,)]).to(A) * h)
             speed = n_x - 3 + torch.arange(3)
             A[torch.arange(3), speed] = h * decay.expand(3)
             A[speed, speed] = decay.expand(3)
@@ -470,11 +468,19 @@ def to_body(x: Tensor, points: Tensor) -> Tensor:
     return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
 
 
-def _number(name: str, value: Any, least: float = -math.inf, strict: bool = False) -> Tensor:
-    """Convert a number of at least (`strict`: above) `least` to a finite float64 tensor; a tensor is not converted."""
+def _number(
+    name: str, value: Any, least: float = -math.inf, strict: bool = False, sizes: Sequence[tuple[int, ...]] = ()
+) -> Tensor:
+    """Convert a number of at least (`strict`: above) `least` to a finite float64 tensor; a tensor is not converted.
+
+    `sizes`: those that it may have, where not any.
+    """
     if not isinstance(value, Tensor):
-        value = torch.from_numpy(check_array(name, value).copy())
+        value = torch.from_numpy(check_array(name, value))
     check_tensor(name, value)
+    if sizes and value.shape not in sizes:
+        wanted = " or ".join(str(size) if size else "a number" for size in sizes)
+        raise ShapeError(f"{name}: expected {wanted}, got {describe(value)}; give so many")
     if least > -math.inf and not is_wrapped(value) and bool(((value <= least) if strict else (value < least)).any()):
         raise InvalidInputError(
             f"{name}: expected numbers {'above' if strict else 'of at least'} {least:g}, got {float(value.min()):g}; "

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_array, check_kind, check_number, check_tensor, describe
+from difflcs._checks import check_array, check_list, check_number, check_shape, check_tensor, describe
 from difflcs._differentiation import transforms_active
 from difflcs._recall import Recall
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.errors import InvalidInputError
 
 _ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
 
@@ -100,11 +100,7 @@ class Polygon(Shape):
 
     def __post_init__(self) -> None:
         vertices = _tensor("vertices", self.vertices)
-        if vertices.ndim != 2 or vertices.shape[1] != 2 or len(vertices) < 3:
-            raise ShapeError(
-                f"vertices: expected (n, 2) with at least 3 corners, got {tuple(vertices.shape)}; give one row "
-                f"for each corner"
-            )
+        check_shape("vertices", vertices, "3+ 2", remedy="give one row for each corner")
         at = vertices.detach()
         sides = (at.roll(-1, 0) - at).norm(dim=1)
         longest = float(sides.max())
@@ -204,11 +200,9 @@ class Circle(Shape):
     center: Tensor = (0.0, 0.0)  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        r, center = _tensor("r", self.r), _tensor("center", self.center)
+        r, center = _tensor("r", self.r), check_shape("center", _tensor("center", self.center), "2")
         if r.ndim or not float(r.detach()) > 0:
             raise InvalidInputError(f"r: expected one number above 0, got {describe(self.r)}; give the radius")
-        if center.shape != (2,):
-            raise ShapeError(f"center: expected (2,), got {tuple(center.shape)}; give x and y")
         object.__setattr__(self, "r", r)
         object.__setattr__(self, "center", center)
 
@@ -251,8 +245,7 @@ class Union(Shape):
 
     def __post_init__(self) -> None:
         parts = []
-        for part in self.parts:
-            check_kind("parts", part, Shape, "give Circle, Polygon or Union")
+        for part in check_list("parts", self.parts, "give Circle, Polygon or Union", Shape):
             parts += part.parts if isinstance(part, Union) else [part]
         if not parts:
             raise InvalidInputError("parts: expected at least one shape, got none; give Circle or Polygon")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import check_kind, check_list, check_number, check_positive_int, takes
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoCost, MujocoLCS, Position
 
@@ -56,8 +56,10 @@ class BodyPlaces:
         reach: float | None = None,
         height: float | None = None,
     ):
-        self._cost = MujocoCost(module, [Position(name) for name in effectors])
+        names = check_list("effectors", effectors, "name bodies, sites or geoms")
+        self._cost = MujocoCost(module, [Position(name) for name in names])
         self.module, self.n_places = module, check_positive_int("n_places", n_places)
+        self.n_x, self.n_effectors, self.n_place = module.n_x, len(names), 3 * len(names)
         self.gap = 0.1 * module.length if gap is None else check_number("gap", gap, strict=True)
         self.reach = module.length if reach is None else check_number("reach", reach)
         self.height, model = height, module._model
@@ -75,33 +77,39 @@ class BodyPlaces:
         if not own or not all(map(len, self._pairs)):
             raise InvalidInputError(
                 f"effectors: expected bodies that slides or hinges of their own move, and that may touch the body "
-                f"{body!r:.100}, got {list(effectors)}; name such, and let the module's `pairs` have them"
+                f"{body!r:.100}, got {names}; name such, and let the module's `pairs` have them"
             )
 
+    @takes(x="n_x")
     def sample(self, x: Tensor) -> Tensor:
         """See `Places`: (n, 3 · n_effectors) in coordinates of the body."""
         points = torch.cat([self.ring(x, k, self.gap) for k in range(len(self._pairs))])
         place, turn = self._pose(x)
         return ((points - place) @ turn).flatten(1)
 
+    @takes(x="n_x", places="n n_place")
     def states(self, x: Tensor, places: Tensor) -> Tensor:
         """See `Places`."""
         place, turn = self._pose(x)
         return self.at(x, places.unflatten(-1, (-1, 3)) @ turn.mT + place)
 
+    @takes(states="... n_x")
     def allowed(self, states: Tensor) -> Tensor:
         """See `Places`."""
         return self.gaps(states) > 0
 
+    @takes(x="n_x")
     def near(self, x: Tensor) -> bool:
         """See `Places`."""
         return bool(self.gaps(x, self._pushed) < self.reach)
 
+    @takes(x="... n_x")
     def points(self, x: Tensor) -> Tensor:
         """Compute where the end effectors are (..., n_effectors, 3) at states x (..., n_x) [m]."""
         A, offset, _ = map(torch.as_tensor, self._cost._scene.read(x, self._cost._rows))
         return ((A @ x.unsqueeze(-1)).squeeze(-1) + offset).unflatten(-1, (-1, 3))
 
+    @takes(x="n_x", points="n n_effectors 3")
     def at(self, x: Tensor, points: Tensor) -> Tensor:
         """Find states (n, n_x) at rest near x (n_x,) with end effectors at points (n, n_effectors, 3), or near."""
         states, nv = x.repeat(len(points), 1), self.module.state.nv
@@ -180,19 +188,23 @@ class BodyTravel:
         tolerance: float | None = None,
         step: float | None = None,
     ):
-        self.places, self.over = places, None if over is None else check_number("over", over)
+        self.places = check_kind("places", places, BodyPlaces)
+        self.n_x, self.over = places.n_x, None if over is None else check_number("over", over)
         self.clearance = 3 * places.gap if clearance is None else check_number("clearance", clearance, strict=True)
         self.tolerance = places.gap if tolerance is None else check_number("tolerance", tolerance, strict=True)
         self.step = math.inf if step is None else check_number("step", step, strict=True)
 
+    @takes(x="n_x", states="... n_x")
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
         """See `Travel`: the straight distance of the end effector that has farthest to go."""
         return (self.places.points(states) - self.places.points(x)).norm(dim=-1).amax(-1)
 
+    @takes(x="n_x", target="n_x")
     def arrived(self, x: Tensor, target: Tensor) -> bool:
         """See `Travel`."""
         return bool(self.distance(x, target) < self.tolerance)
 
+    @takes(x="n_x", target="n_x")
     def action(self, x: Tensor, target: Tensor) -> Tensor:
         """See `Travel`."""
         return self._drive(x, self._corner(x, target)[self.places._columns])

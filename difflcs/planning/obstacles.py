@@ -7,9 +7,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_number, check_tensor
+from difflcs._checks import check_kind, check_list, check_number, check_shape, takes
 from difflcs.constraints import LinearConstraints
-from difflcs.errors import ShapeError
 from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import DistanceGrid, clearance, ring
@@ -46,7 +45,7 @@ class Obstacles:
         self.radius, self.price = check_number("radius", radius, strict=True), check_number("price", price, strict=True)
         self.margin = radius / 3 if margin is None else check_number("margin", margin, strict=True)
         self._outline = ring(check_kind("body", body, Shape), self.margin, _OUTLINE)
-        axis = torch.arange(-body.radius, body.radius, radius, dtype=torch.float64)
+        axis = torch.arange(-body.radius, body.radius, self.radius, dtype=torch.float64)
         points = torch.cartesian_prod(axis, axis)
         self._inside = points[body.contains(points)]
         self._rings: dict[tuple[Shape, float, int], Tensor] = {}
@@ -59,8 +58,8 @@ class Obstacles:
         Raises:
             ShapeError: there is not one pose for each shape.
         """
-        if check_tensor("poses", poses, [("3", 3)]).shape != (len(shapes), 3):
-            raise ShapeError(f"poses: expected ({len(shapes)}, 3), got {tuple(poses.shape)}; give one for each shape")
+        shapes = check_list("shapes", shapes, "give Circle, Polygon or Union", Shape)
+        poses = check_shape("poses", poses, f"{len(shapes)} 3").to("cpu", torch.float64)
         if self.shapes == tuple(shapes) and bool(((self.poses - poses).abs() < _STILL * self.radius).all()):
             return
         self.shapes, self.poses = tuple(shapes), poses.clone()
@@ -75,6 +74,7 @@ class Obstacles:
             extent = max(away + shape.radius for away, shape in zip(apart, shapes, strict=True))
             self._grid = DistanceGrid(self._distance, extent + reach)
 
+    @takes(points="... 2")
     def gap(self, points: Tensor) -> Tensor:
         """Compute the distance (...) of points (..., 2) to the nearest obstacle, or less where it is far; ∞ without."""
         if not self.shapes:
@@ -88,17 +88,19 @@ class Obstacles:
         gaps = [self._grids[shape].distance(to_body(pose, flat)) for shape, pose in placed]
         return torch.stack(gaps).amin(0).reshape(points.shape[:-1])
 
+    @takes(poses="... 3")
     def body_gap(self, poses: Tensor) -> Tensor:
         """Compute the gap (...) between the body at poses (..., 3) and the obstacles."""
         outline, inside = (poses[..., None, :2] + _turned(poses, points) for points in (self._outline, self._inside))
         gaps = torch.cat([self.gap(outline) + self.margin, self.gap(inside)], -1)  # small obstacles may be inside
         return gaps.amin(-1)
 
+    @takes(states="n 5+")
     def constraints(self, states: Tensor) -> LinearConstraints | None:
         """Make half-planes for plans from states (n, n_x); None where everything is far away."""
         arms = _turned(states, self._outline)
         gap, nearest = self.gap(states[:, None, :2] + arms).unflatten(1, (_ARCS, -1)).min(-1)
-        if not bool(gap.amin() < _FAR * self.radius):
+        if not bool((gap < _FAR * self.radius).any()):
             return None
         rows = gap.topk(_ROWS, largest=False).indices
         rows = rows * (_OUTLINE // _ARCS) + nearest.gather(1, rows)

@@ -74,6 +74,8 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
         grid = DistanceGrid(partial(clearance, shape), shape.radius + distance)
         traced = _trace_loops((grid.values - distance).numpy(), grid.axis.numpy())
         curves = [torch.from_numpy(curve) for curve in traced]
+        if not curves:
+            raise InvalidInputError(f"distance: expected one that numbers can hold, got {distance:g}; take a smaller")
         curve = max(curves, key=lambda curve: float(shoelace(curve).sum()))
         sides = curve.roll(-1, 0) - curve
         apart = sum(not bool(is_inside(other[0] - curve, sides)) for other in curves if other is not curve)

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_array, check_kind, check_number, check_tensor, describe, make_plain
+from difflcs._checks import check_array, check_kind, check_number, describe, make_plain, takes
 from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
@@ -16,6 +16,7 @@ from difflcs.planning.obstacles import Obstacles
 from difflcs.planning.outline import clearance, ring
 
 
+@runtime_checkable
 class Places(Protocol):
     """Candidate places of the end effectors. A place is a row of numbers that moves with the body."""
 
@@ -55,7 +56,7 @@ class Workspace:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        check_number("step", self.step, strict=True)
+        vars(self)["step"] = check_number("step", self.step, strict=True)
         for name in ("low", "high"):
             if check_array(name, getattr(self, name)).shape != (2,):
                 raise ShapeError(f"{name}: expected x and y, got {describe(getattr(self, name))}; give a corner")
@@ -64,6 +65,7 @@ class Workspace:
                 f"low: expected less than high in x and y, got {tuple(self.low)} and {tuple(self.high)}; exchange them"
             )
 
+    @takes(states="... 5+")
     def bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return u_min and u_max (..., 2) of relative actions at states (..., n_x) of `difflcs.physics.PlanarPushing`.
 
@@ -73,10 +75,12 @@ class Workspace:
         low, high = (disc.new_tensor(corner) - disc for corner in (self.low, self.high))
         return low.clamp(-self.step, 0.0), high.clamp(0.0, self.step)
 
+    @takes(points="... 2")
     def clamp(self, points: Tensor) -> Tensor:
         """Move points (..., 2) that are outside to the border."""
         return torch.minimum(torch.maximum(points, points.new_tensor(self.low)), points.new_tensor(self.high))
 
+    @takes(points="... 2")
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
         """Return a mask (...), True for points (..., 2) that are inside and `margin` away from the border [length]."""
         low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin
@@ -135,14 +139,15 @@ class DiscPlaces:
         """See `Places`: (n_places, 2) in coordinates of the body."""
         return self.ring
 
+    @takes(x="5+", places="n 2")
     def states(self, x: Tensor, places: Tensor) -> Tensor:
         """See `Places`."""
-        check_tensor("places", places, [("2", 2)])
         states = x.expand(len(places), -1).clone()
         states[:, 3:5] = from_body(x, places)
         states[:, 5:] = 0.0  # velocities of disc and body, if the state has any: both are at rest by then
         return states
 
+    @takes(states="n 5+")
     def allowed(self, states: Tensor) -> Tensor:
         """See `Places`."""
         allowed, discs = torch.ones(len(states), dtype=torch.bool), states[:, 3:5]
@@ -152,6 +157,7 @@ class DiscPlaces:
             allowed &= self.obstacles.gap(discs) > self.radius + self.gap
         return allowed
 
+    @takes(x="5+")
     def near(self, x: Tensor) -> bool:
         """See `Places`."""
         return bool(clearance(self.shape, to_body(x, x[None, 3:5])) - self.radius < self.reach)

@@ -28,7 +28,16 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_array, check_kind, check_number, check_positive_int, check_tensor, make_plain
+from difflcs._checks import (
+    check_array,
+    check_kind,
+    check_list,
+    check_number,
+    check_positive_int,
+    check_shape,
+    check_tensor,
+    make_plain,
+)
 from difflcs.constraints import LinearConstraints
 from difflcs.errors import InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
@@ -157,10 +166,14 @@ class SamplingPolicy:
                 'mpc: expected a layer with on_failure="mask", got "raise"; one place without a solution must not stop '
                 "the others"
             )
-        self.mpc, self.places, self.travel, self.bounds = mpc, places, travel, bounds
+        for name, function in (("bounds", bounds), ("constraints", constraints)):
+            check_kind(name, function, (Callable, type(None)), "give a function of states")
+        self.mpc, self.bounds, self.constraints = mpc, bounds, constraints
+        self.places = check_kind("places", places, Places, "give DiscPlaces, for example")
+        self.travel = check_kind("travel", travel, Travel, "give PlanarTravel, for example")
         self.settings = check_kind("settings", SamplingSettings() if settings is None else settings, SamplingSettings)
-        self.constraints = constraints
-        self.angles = list(angles)
+        angles = check_list("angles", angles, "give components of the goal, such as (2,)")
+        self.angles = [check_positive_int("angles", index, minimum=0) for index in angles]
         self.reset()
 
     def reset(self) -> None:
@@ -203,12 +216,11 @@ class SamplingPolicy:
             return self._decide(state, target, context, stay=place is not None)
 
     def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
-        state = check_tensor("x", torch.from_numpy(check_array("x", x)), [("n_x", self.mpc.lcs.n_x)])
-        if state.ndim != 1:
-            raise ShapeError(f"x: expected shape ({self.mpc.lcs.n_x},), got {tuple(state.shape)}; give one robot's")
+        n_x = str(self.mpc.lcs.n_x)
+        state = check_shape("x", torch.from_numpy(check_array("x", x)), n_x, remedy="give one robot's")
         if goal is None:
             return state, None
-        target = check_tensor("goal", torch.from_numpy(check_array("goal", goal).copy()))
+        target = check_tensor("goal", torch.from_numpy(check_array("goal", goal)))
         if target.ndim != 1 or any(index >= len(target) for index in self.angles):
             raise ShapeError(
                 f"goal: expected one vector that has the angles {self.angles}, got shape {tuple(target.shape)}; "
@@ -274,7 +286,7 @@ class SamplingPolicy:
             scores[best] = -math.inf
 
     def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
-        low, high = (None, None) if self.bounds is None else self.bounds(states)
+        low, high = (None, None) if self.bounds is None else check_kind("bounds(x)", self.bounds(states), tuple)
         rows = None if self.constraints is None else self.constraints(states)
         with warnings.catch_warnings():  # what was not solved is in the decision
             warnings.simplefilter("ignore", SolveWarning)

@@ -2,12 +2,12 @@
 
 import math
 from functools import partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_number
+from difflcs._checks import check_kind, check_number, takes
 from difflcs.physics.planar import Drive, PositionDrive, to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.obstacles import Obstacles
@@ -24,6 +24,7 @@ _LEAST = 0.3  # of the clearance, that must be left on the way
 _SPEED, _TOUCH = 0.02, 1e3  # prices of a speed at the end [length per speed] and of a gap that is too small
 
 
+@runtime_checkable
 class Travel(Protocol):
     """A path from a state to another that differs from it only in the end effectors."""
 
@@ -84,6 +85,7 @@ class PlanarTravel:
         with torch.no_grad():
             course = check_kind("drive", PositionDrive() if drive is None else drive, Drive).course()
             instants, order = len(course.b), course.b.shape[-1]
+            self.n_x = f"{3 + 2 * order}+"  # see `takes`
             self._A = course.A.reshape(instants, -1, order, order).expand(-1, 2, -1, -1)  # by coordinate
             self._b = course.b.reshape(instants, -1, order).expand(-1, 2, -1)
             self._grid = DistanceGrid(partial(clearance_of, shape), shape.radius + 2 * (radius + self.clearance))
@@ -93,10 +95,11 @@ class PlanarTravel:
         self.obstacles = check_kind("obstacles", obstacles, (Obstacles, type(None)))
         self._surveyed: tuple[Tensor, Tensor, Tensor] | None = None
 
+    @takes(x="n_x", states="n n_x")
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
         """See `Travel`: the straight distance; far more than any where obstacles leave no way."""
         straight = (states[:, 3:5] - x[3:5]).norm(dim=-1)
-        if self._in_the_way() is None:
+        if self._in_the_way() is None or not len(states):
             return straight
         with torch.no_grad():
             start, ends = to_body(x, x[None, 3:5])[0], to_body(x, states[:, 3:5])
@@ -104,11 +107,13 @@ class PlanarTravel:
             open_to = length[torch.cdist(ends, nodes).argmin(1)].isfinite() | self._in_sight(x, start, ends)
             return torch.where(open_to, straight, _NO_WAY)
 
+    @takes(x="n_x", target="n_x")
     def action(self, x: Tensor, target: Tensor) -> Tensor:
         """See `Travel`."""
         with torch.no_grad():
             return self._send(x, target[3:5])
 
+    @takes(x="n_x", target="n_x")
     def arrived(self, x: Tensor, target: Tensor) -> bool:
         """See `Travel`."""
         return bool((target[3:5] - x[3:5]).norm() < self.tolerance)

@@ -176,9 +176,7 @@ def _read(file: Path) -> ModelCard:
     wanted = {f.name for f in fields(ModelCard)}
     if not isinstance(values, dict) or set(values) != wanted:
         got = sorted(values) if isinstance(values, dict) else type(values).__name__
-        raise CheckpointError(
-            f"{file}: expected the fields {sorted(wanted)} of a card, got {_storage.short(got)}; {remedy}"
-        )
+        raise CheckpointError(f"{file}: expected fields {sorted(wanted)}, got {_storage.short(got)}; {remedy}")
     kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
     kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
     for name, kind in kinds.items():
@@ -191,9 +189,7 @@ def _read(file: Path) -> ModelCard:
             raise CheckpointError(f"{file}: expected {low} to {high:g} for {name}, got {values[name]}; {remedy}")
     check_object(values["object"], file)
     if not all(isinstance(version, str | None) for version in values["versions"].values()):
-        raise CheckpointError(
-            f"{file}: expected texts for versions, got {_storage.short(values['versions'])}; {remedy}"
-        )
+        raise CheckpointError(f"{file}: expected texts as versions, got {_storage.short(values['versions'])}; {remedy}")
     return ModelCard(**values)
 
 

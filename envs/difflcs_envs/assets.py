@@ -170,9 +170,7 @@ def _known_hashes(folder: Path) -> dict[str, str]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError) as error:
-        raise AssetError(
-            f"{path}: expected recorded checksums, cannot read them ({error}). Delete the file."
-        ) from error
+        raise AssetError(f"{path}: expected recorded checksums, cannot read them ({error}). Delete it.") from error
     return known
 
 

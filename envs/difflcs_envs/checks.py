@@ -18,9 +18,7 @@ def checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"Expected {name} = {meaning}, shape ({size},), got {value!r}. Pass {size} numbers."
-        ) from error
+        raise ValueError(f"Expected {name} = {meaning}, shape ({size},), got {value!r}. Pass so many.") from error
     if array.shape != (size,):
         raise ValueError(
             f"Expected {name} = {meaning}, shape ({size},), got shape {array.shape}. Pass {size} numbers, unbatched."
@@ -37,9 +35,7 @@ def checked_number(name: str, value: Any, low: float, high: float = math.inf, lo
     number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
     if not math.isfinite(number) or not low <= number <= high or (low_open and number == low):
         bounds = f"{'>' if low_open else '>='} {low:g}" + (f" and <= {high:g}" if math.isfinite(high) else "")
-        raise ValueError(
-            f"Expected {name} to be a finite number {bounds}, got {value!r}. Choose a value in this range."
-        )
+        raise ValueError(f"Expected {name} to be a finite number {bounds}, got {value!r}. Choose one in this range.")
     return number
 
 

@@ -63,9 +63,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         super().reset(seed=seed)
         goal, state = options.pop("goal", None), options.pop("state", None)
         if options:
-            raise ValueError(
-                f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
-            )
+            raise ValueError(f"Expected options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them.")
         self._steps = None  # an option that is refused below leaves no episode to step
         info = self._start(goal, state)
         self._steps = 0
@@ -85,9 +83,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             gymnasium.error.ResetNeeded: No episode is running.
         """
         if self._steps is None:
-            raise ResetNeeded(
-                "Expected a running episode, but it has ended or never began. Call reset() before step()."
-            )
+            raise ResetNeeded("Expected a running episode, but it has ended or never began. Call reset() first.")
         assert self.action_space.shape is not None
         requested = checked_array("action", action, self.action_space.shape[0], self.action_meaning)
         executed = requested.clip(-self.action_limit, self.action_limit)

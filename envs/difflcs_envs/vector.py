@@ -66,9 +66,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ValueError(f"Expected num_envs to be a whole number >= 1, got {num_envs!r}. Choose such a number.")
         if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise ValueError(
-                f"Expected threads to be a whole number >= 1 or None, got {threads!r}. Choose such a number."
-            )
+            raise ValueError(f"Expected threads to be a whole number >= 1 or None, got {threads!r}. Choose one.")
         self.num_envs = int(num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # pyright: ignore[reportAttributeAccessIssue]

@@ -19,6 +19,7 @@ from difflcs.rl.runs.trained import TrainedPolicy
 from difflcs.rl.runs.training import TrainConfig, load_model
 from difflcs.rl.tasks import get_task, task_names
 from reproduce import add_to_zoo as adding
+from tests.conftest import refuse
 
 CUBE = "trifinger-cube"
 OBJECT = {"name": "mug", "source": "ycb_mesh", "mass": 0.05, "sha256": "abc"}
@@ -69,8 +70,7 @@ def test_every_model_fits_its_card(name):
         model = LCSModel.from_pretrained(name)
         assert (model.n_x, model.n_u, model.A.dtype) == (9, 6, torch.float64)
     else:
-        with pytest.raises(CheckpointError, match="LCSModel"):
-            LCSModel.from_pretrained(name)
+        refuse(CheckpointError, "LCSModel", LCSModel.from_pretrained, name)
     assert TrainedPolicy.open(f"zoo:{name}").finished
     assert hash(card) == hash(zoo.card(f"zoo:{name}"))
 
@@ -129,10 +129,8 @@ def test_an_unknown_name_gets_the_names_there_are_and_the_nearest(name, tmp_path
 
 
 def test_a_path_is_never_taken_for_a_name(tmp_path):
-    with pytest.raises(CheckpointError, match="a file is missing"):
-        LCSModel.from_pretrained(tmp_path / "trifinger-cub")
-    with pytest.raises(CheckpointError, match="`difflcs zoo` lists them"):
-        LCSModel.from_pretrained("zoo:../secrets")
+    refuse(CheckpointError, "a file is missing", LCSModel.from_pretrained, tmp_path / "trifinger-cub")
+    refuse(CheckpointError, "`difflcs zoo` lists them", LCSModel.from_pretrained, "zoo:../secrets")
 
 
 def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
@@ -156,8 +154,7 @@ def test_nothing_is_overwritten_without_force(tmp_path):
     run = make_run(tmp_path / "run").path
     adding.add(run, root=root)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
-    with pytest.raises(CheckpointError, match="--force"):
-        adding.add(run, root=root)
+    refuse(CheckpointError, "--force", adding.add, run, root=root)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
     other = make_run(tmp_path / "other", n_lam=4).path
     assert adding.add(other, root=root, force=True).settings["settings"]["n_lam"] == 4

@@ -14,6 +14,7 @@ from difflcs.rl import Adam, Epochs, Rollouts, ViolationLoss, Warmup, WarmupSett
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.rollout import mpc_actions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
+from tests.conftest import refuse
 from tests.training import slide
 from tests.training.slide import STEPS, U_MAX, Gain, Gains, parameters, recorded, same
 
@@ -172,8 +173,7 @@ def test_tied_parameters_are_saved(tmp_path):
 def test_load_refuses_another_module():
     state = make_warmup(Gain()).state_dict()
     assert state["learned"]["settings"] == {"class": "Gain", "n_x": 1, "n_u": 1, "n_lam": 1}
-    with pytest.raises(CheckpointError, match="other settings"):
-        make_warmup(Tied()).load(state)
+    refuse(CheckpointError, "other settings", make_warmup(Tied()).load, state)
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -223,13 +223,11 @@ def slide_warmup(lcs: Any) -> Warmup:
 @pytest.mark.parametrize(("lcs", "error", "message"), BAD)
 def test_what_cannot_be_learned_is_refused(lcs, error, message):
     for make in (slide_warmup, make_trainer, lambda module: make_trainer(module, update="adam")):
-        with pytest.raises(error, match=message):
-            make(lcs)
+        refuse(error, message, make, lcs)
 
 
 def test_other_sizes_than_the_environments_are_refused():
-    with pytest.raises(InvalidInputError, match=r"lcs: expected n_x=1, n_u=1 like the states .* n_u=2 of Wide"):
-        slide_warmup(Wide())
+    refuse(InvalidInputError, r"lcs: expected n_x=1, n_u=1 like the states .* n_u=2 of Wide", slide_warmup, Wide())
     settings, mpc = slide.small_settings(), LCSMPCLayer(LCSModel(2, 1, 1), GoalCost.reach(2, 1), 3, -1.0, 1.0)
     with pytest.raises(InvalidInputError, match=r"actor: expected n_x=1, n_u=1 .* got n_x=2"):
         make_ppo(make_actor(mpc, settings.std), make_envs(12), settings, 0, features=features, total_episodes=12)
@@ -237,10 +235,8 @@ def test_other_sizes_than_the_environments_are_refused():
 
 @pytest.mark.parametrize("update", ["natural", "adam"])
 def test_a_system_without_gradient_is_refused(update):
-    with pytest.raises(InvalidInputError, match="depends on the module's parameters"):
-        slide_warmup(Detached()).step()
-    with pytest.raises(InvalidInputError, match="depends on the module's parameters"):
-        make_trainer(Detached(), update=update).step()
+    refuse(InvalidInputError, "depends on the module's parameters", slide_warmup(Detached()).step)
+    refuse(InvalidInputError, "depends on the module's parameters", make_trainer(Detached(), update=update).step)
 
 
 def test_a_sequence_is_no_system_of_transitions():

@@ -8,6 +8,7 @@ from PIL import Image
 
 from difflcs import Animation
 from difflcs.errors import InvalidInputError
+from tests.conftest import refuse
 
 FRAMES = [np.full((6, 8, 3), shade, np.uint8) for shade in (0, 90, 250)]
 
@@ -31,11 +32,9 @@ def test_a_drawn_figure_is_saved_by_its_ending_and_closed(tmp_path):
         film.save(tmp_path / f"film.{kind}")
         with Image.open(tmp_path / f"film.{kind}") as picture:
             assert (picture.format.lower(), picture.n_frames) == (kind, 4)
-    with pytest.raises(InvalidInputError, match=r"ends in \.gif or \.png"):
-        film.save(tmp_path / "film.mp4")
+    refuse(InvalidInputError, r"ends in \.gif or \.png", film.save, tmp_path / "film.mp4")
 
 
 @pytest.mark.parametrize("frames", [[], [FRAMES[0], FRAMES[0][:4]]], ids=["none", "two sizes"])
 def test_frames_that_are_no_film_are_refused(frames):
-    with pytest.raises(InvalidInputError, match="of one size"):
-        Animation(frames, fps=10)
+    refuse(InvalidInputError, "of one size", Animation, frames, fps=10)

@@ -10,7 +10,6 @@ from torch.utils._pytree import tree_leaves
 
 from difflcs import (
     ConstraintSequence,
-    DiffLCSError,
     GoalCost,
     LCSModel,
     LCSMPCLayer,
@@ -26,15 +25,9 @@ from difflcs import errors as e
 from difflcs._checks import check_tensor
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import BatchedBackend
+from tests.conftest import refuse
 
 NAN, INF = float("nan"), float("inf")
-
-
-def refuse(error, match, function, *args, **kwargs):
-    with pytest.raises(error, match=match) as caught:
-        function(*args, **kwargs)
-    assert isinstance(caught.value, DiffLCSError)
-    return str(caught.value)
 
 
 def spoil(tensor, value):

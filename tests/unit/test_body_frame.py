@@ -16,6 +16,7 @@ from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.physics import BodyFrameLCS, Frame
 from difflcs.rl import Epochs, FrameMethod, LCSMPCPolicy, Work, get_task
 from difflcs.rl.learning.jacobian import system_jacobian
+from tests.conftest import refuse
 
 FRAME = Frame(3, (1, 2), ((0, 6), (4, 5)), ((3, 1), (0, 2)))
 """Columns out of order, the last is a plain number."""
@@ -75,13 +76,11 @@ def test_files_and_frames(lcs, tmp_path, build):
     again = BodyFrameLCS.from_pretrained(tmp_path)
     assert again.frame == FRAME._replace(vectors=((0, 2), (3, 1)))
     torch.testing.assert_close(again.params(x.float()).A, lcs.params(x.float().double()).A, rtol=0, atol=0)
-    with pytest.raises(CheckpointError, match="BodyFrameLCS"):
-        LCSModel.from_pretrained(tmp_path)
+    refuse(CheckpointError, "BodyFrameLCS", LCSModel.from_pretrained, tmp_path)
     for wrong in (FRAME._replace(yaw=8), FRAME._replace(yaw=1), FRAME._replace(vectors=((0, 5),))):
-        with pytest.raises(InvalidInputError, match="frame: expected columns below"):
-            BodyFrameLCS(8, 5, 3, frame=wrong)
-    with pytest.raises(InvalidInputError, match="x: expected the states of the system"):
-        lcs.params()
+        refuse(InvalidInputError, "frame: expected columns below", BodyFrameLCS, 8, 5, 3, frame=wrong)
+    refuse(InvalidInputError, "frame: expected Frame", BodyFrameLCS, 8, 5, 3, frame="xy")
+    refuse(InvalidInputError, "x: expected the states of the system", lcs.params)
 
 
 def test_without_a_frame_it_is_a_constant_lcs(build):

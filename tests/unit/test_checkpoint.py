@@ -18,6 +18,7 @@ from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
 from difflcs.rl.learning.state_tree import flatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from tests.conftest import refuse
 
 
 def make_model(seed: int) -> LCSModel:
@@ -116,8 +117,7 @@ def test_corrupt_checkpoints_are_refused_and_untouched(tmp_path, corrupt):
         save(tmp_path, iteration)
     corrupt(tmp_path)
     before = contents(tmp_path)
-    with pytest.raises(CheckpointError, match=r"expected|match"):
-        load_checkpoint(tmp_path)
+    refuse(CheckpointError, r"expected|match", load_checkpoint, tmp_path)
     assert contents(tmp_path) == before
 
 
@@ -125,16 +125,13 @@ def test_a_corrupt_checkpoint_names_the_older_one(tmp_path):
     for iteration in (1, 2):
         save(tmp_path, iteration)
     _flip(tmp_path / "000002/model.safetensors")
-    with pytest.raises(CheckpointError, match="000001"):
-        load_checkpoint(tmp_path)
+    refuse(CheckpointError, "000001", load_checkpoint, tmp_path)
 
 
 def test_run_directory_refuses_what_is_there(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(CheckpointError, match="--resume"):
-        RunDirectory.create(tmp_path, {})
-    with pytest.raises(CheckpointError, match="difflcs train"):
-        RunDirectory.open(tmp_path)
+    refuse(CheckpointError, "--resume", RunDirectory.create, tmp_path, {})
+    refuse(CheckpointError, "difflcs train", RunDirectory.open, tmp_path)
     assert contents(tmp_path) == {"thesis.txt": b"mine"}
 
 

@@ -15,6 +15,7 @@ from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
 from difflcs.rl.methods.contact_lcs import known_physics
 from tests.conformance.toy import Guess, Slide, make_task
+from tests.conftest import refuse
 
 F64 = torch.float64
 SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)
@@ -69,10 +70,8 @@ def test_a_description_of_physics_is_checked():
         ({"horizon": 0}, InvalidInputError),
         ({"relaxation": -1.0}, InvalidInputError),
     ):
-        with pytest.raises(error, match=next(iter(wrong))):
-            PhysicsSpec(**{"make_system": lambda: None, "scale": (1.0,), **wrong})
-    with pytest.raises(DTypeError, match="physics: expected PhysicsSpec"):
-        make_task(physics=ContactLCS)
+        refuse(error, next(iter(wrong)), PhysicsSpec, **{"make_system": lambda: None, "scale": (1.0,), **wrong})
+    refuse(DTypeError, "physics: expected PhysicsSpec", make_task, physics=ContactLCS)
 
 
 def test_the_policy_plans_with_what_the_description_says():
@@ -86,8 +85,7 @@ def test_the_policy_plans_with_what_the_description_says():
 
 def test_a_task_without_physics_is_refused():
     task = make_task(physics=None)
-    with pytest.raises(InvalidInputError, match="known physics for contact-lcs, got toy without"):
-        known_physics(task)
+    refuse(InvalidInputError, "known physics for contact-lcs, got toy without", known_physics, task)
 
 
 def test_what_was_learned_of_another_object_is_refused():
@@ -107,8 +105,7 @@ def test_what_was_learned_of_another_object_is_refused():
     with pytest.raises(CheckpointError, match="expected tensors"):
         method.rebuild(task(0.03), configuration(learned), dict(list(state.items())[1:]), "here")
     broken = {**state, "change.friction": torch.full((1,), torch.nan, dtype=F64)}
-    with pytest.raises(CheckpointError, match="expected finite"):
-        method.rebuild(task(0.03), configuration(learned), broken, "here")
+    refuse(CheckpointError, "expected finite", method.rebuild, task(0.03), configuration(learned), broken, "here")
 
 
 def test_it_learns_how_a_point_slides():
@@ -126,8 +123,7 @@ def test_it_learns_how_a_point_slides():
     assert float(guess.fade.detach()) == pytest.approx(0.5, abs=0.05)
     assert reports[-1].loss < 0.01 * reports[0].first_loss
     assert evaluate(envs, trainer.policy, 20, 3, 5).median_errors["position_error"] < before
-    with pytest.raises(InvalidInputError, match="all of them are done"):
-        trainer.step()
+    refuse(InvalidInputError, "all of them are done", trainer.step)
     trainer.env.close()
     envs.close()
 

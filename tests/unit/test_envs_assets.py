@@ -184,7 +184,7 @@ def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
 )  # fmt: skip
 def test_recorded_hashes_that_are_none(server, tmp_path, content):
     (tmp_path / "sha256.json").write_bytes(content)
-    with pytest.raises(AssetError, match=r"sha256.json: expected recorded checksums.*Delete the file"):
+    with pytest.raises(AssetError, match=r"sha256.json: expected recorded checksums.*Delete it"):
         fetch(server, tmp_path)
     assert (tmp_path / "sha256.json").read_bytes() == content
     assert server.requests == 0

@@ -127,7 +127,7 @@ def test_an_interrupt_during_a_write_leaves_the_old_file(tmp_path, monkeypatch, 
 def test_a_lock_without_its_package_names_the_line_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "filelock", None)
     with (
-        pytest.raises(MissingDependencyError, match=r"filelock, not installed; run: pip install"),
+        pytest.raises(MissingDependencyError, match=r"filelock, got none; run: pip install"),
         _storage.locked(tmp_path),
     ):
         pass

@@ -7,6 +7,7 @@ import torch
 
 from difflcs import LCSModel
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from tests.conftest import refuse
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 
@@ -61,8 +62,7 @@ def test_from_params_refuses_a_stiffness_that_cannot_represent_F(build):
 
 
 def test_from_params_refuses_a_batch_of_systems(build):
-    with pytest.raises(ShapeError, match=r"no batch dimensions, got \(2,\)"):
-        LCSModel.from_params(build.params(batch=(2,)))
+    refuse(ShapeError, r"no batch dimensions, got \(2,\)", LCSModel.from_params, build.params(batch=(2,)))
 
 
 SUPPORT = torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)
@@ -92,8 +92,7 @@ def test_an_action_support_is_saved_and_can_be_taken_away(tmp_path):
     ],
 )
 def test_an_action_support_that_is_none_is_refused(support, error):
-    with pytest.raises(error, match=r"action_support|u_min"):
-        LCSModel(4, 2, 3, action_support=support)
+    refuse(error, r"action_support|u_min", LCSModel, 4, 2, 3, action_support=support)
 
 
 def test_a_file_with_a_crossed_action_support_is_refused():

@@ -12,6 +12,7 @@ import torch
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS
+from tests.conftest import refuse
 
 F64 = torch.float64
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
@@ -145,10 +146,8 @@ def test_it_counts_rotations_from_where_things_are():
     ],
 )
 def test_what_cannot_be_learned_is_refused(learn, message):
-    with pytest.raises(InvalidInputError, match=message):
-        LearnableMujocoLCS(scene(), learn=learn, motion="dynamic")
-    with pytest.raises(InvalidInputError, match="no friction="):
-        LearnableMujocoLCS(scene(), learn=["friction"], friction=0.3)
+    refuse(InvalidInputError, message, LearnableMujocoLCS, scene(), learn=learn, motion="dynamic")
+    refuse(InvalidInputError, "no friction=", LearnableMujocoLCS, scene(), learn=["friction"], friction=0.3)
 
 
 def saved(value):
@@ -178,5 +177,4 @@ def test_transforms_of_torch_func_map_what_is_learned_and_are_refused_by_fixed_p
     x = states(module.n_x)
     torch.testing.assert_close(torch.vmap(lambda v: module.params(v).A)(x), module.params(x).A)
     for ask in (module.physics.params, module.action_bounds):
-        with pytest.raises(InvalidInputError, match="inside a transform"):
-            torch.vmap(ask)(x)
+        refuse(InvalidInputError, "inside a transform", torch.vmap(ask), x)

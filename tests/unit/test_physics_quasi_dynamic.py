@@ -8,6 +8,7 @@ import torch
 from difflcs import LCSModule
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco import ContactGroup, MujocoLCS, MujocoState
+from tests.conftest import refuse
 
 BOX = '<body name="box" pos="{}"><freejoint/><geom name="block" type="box" size=".05 .03 .02" mass="{}"/></body>'
 
@@ -131,8 +132,7 @@ def test_what_rests_on_contacts_of_a_group_without_friction_does_not_creep(cone)
     ("contacts", "words"), [([], "one at least"), (["block"], "ContactGroup"), ([ContactGroup("x", 1)], "'x'")]
 )
 def test_groups_that_do_not_fit_are_refused(contacts, words):
-    with pytest.raises(InvalidInputError, match=words):
-        MujocoLCS(stack(), motion="quasi-dynamic", contacts=contacts)
+    refuse(InvalidInputError, words, MujocoLCS, stack(), motion="quasi-dynamic", contacts=contacts)
 
 
 def test_the_reference_of_rotations_moves_along():
@@ -148,8 +148,7 @@ def test_the_reference_of_rotations_moves_along():
         after = module.state.to_mujoco(module.params(x).step(x, torch.zeros(0).double()).x_next)[0]
         np.testing.assert_allclose(after, expected, atol=1e-9)
         np.testing.assert_allclose(module.state.to_mujoco(x)[0], data.qpos, atol=1e-12)
-    with pytest.raises(DTypeError, match="follow"):
-        module.observe(data.qpos)
+    refuse(DTypeError, "follow", module.observe, data.qpos)
 
 
 def test_each_state_of_a_batch_has_a_reference_of_its_own():
@@ -162,5 +161,4 @@ def test_each_state_of_a_batch_has_a_reference_of_its_own():
     again = state.to_mujoco(turned)[0]
     np.testing.assert_allclose(again[:, 0, 3:], qpos[:, 3:] / np.linalg.norm(qpos[:, 3:], axis=-1, keepdims=True))
     torch.testing.assert_close(state.to_state(again), turned)
-    with pytest.raises(ShapeError, match="first batch dimensions"):
-        state.to_mujoco(x[0])
+    refuse(ShapeError, "first batch dimensions", state.to_mujoco, x[0])

@@ -10,6 +10,7 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
+from tests.conftest import refuse
 
 F64 = torch.float64
 RADIUS = 0.1
@@ -278,25 +279,22 @@ def test_bounds_that_depend_on_the_state_hold_the_disc_in_the_workspace():
 
 def test_bad_input_is_refused():
     policy = on_a_line()
-    with pytest.raises(ShapeError, match="x: expected"):
-        policy.act([0.0, 0.0, 0.0], [1.0])
-    with pytest.raises(ShapeError, match="one robot"):
-        policy.act([[0.0, 0.51]], [1.0])
+    refuse(ShapeError, "x: expected", policy.act, [0.0, 0.0, 0.0], [1.0])
+    refuse(ShapeError, "one robot", policy.act, [[0.0, 0.51]], [1.0])
     with pytest.raises(NonFiniteError):
         policy.act([math.nan, 0.51], [1.0])
-    with pytest.raises(ShapeError, match="goal"):
-        pushing()[1].act([0.0, 0.0, 0.0, -0.61, 0.0], [1.0, 0.0])
+    refuse(ShapeError, "goal", pushing()[1].act, [0.0, 0.0, 0.0, -0.61, 0.0], [1.0, 0.0])
     mpc = LCSMPCLayer(Line(), GoalCost.reach(2, 1), 4)
-    with pytest.raises(InvalidInputError, match="on_failure"):
-        SamplingPolicy(mpc, Sides(), Jump())
+    refuse(InvalidInputError, "on_failure", SamplingPolicy, mpc, Sides(), Jump())
+    for wrong, match in (({"angles": (-1,)}, "angles: .*at least 0"), ({"bounds": 1.0}, "bounds: expected Callable")):
+        refuse(InvalidInputError, match, SamplingPolicy, policy.mpc, Sides(), Jump(), **wrong)
+    refuse(DTypeError, "places: expected Places", SamplingPolicy, policy.mpc, None, Jump())
     for wrong in (lambda: SamplingPolicy(Line(), Sides(), Jump()), lambda: policy.act(["a", 0.0], [1.0])):
-        with pytest.raises(DTypeError, match=r"LCSMPCLayer|x: expected real numbers"):
-            wrong()
+        refuse(DTypeError, r"LCSMPCLayer|x: expected real numbers", wrong)
 
 
 @pytest.mark.parametrize(
     "bad", [{"keep": 1.5}, {"keep": -0.1}, {"smallest_gain": math.nan}, {"travel_price": -1.0}, {"patience": 0}]
 )
 def test_settings_out_of_range_are_refused(bad):
-    with pytest.raises(InvalidInputError, match=next(iter(bad))):
-        SamplingSettings(**bad)
+    refuse(InvalidInputError, next(iter(bad)), SamplingSettings, **bad)

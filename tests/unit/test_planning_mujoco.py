@@ -7,6 +7,7 @@ import torch
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoLCS
 from difflcs.planning.mujoco import BodyPlaces, BodyTravel
+from tests.conftest import refuse
 
 WORLD = """<mujoco><compiler angle="radian"/><worldbody>
   <body name="box" pos=".35 0 .05"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
@@ -50,7 +51,5 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
         if travel.arrived(x, target):
             break
     assert travel.arrived(x, target)
-    with pytest.raises(InvalidInputError, match="effectors: expected"):
-        BodyPlaces(module, "box", ["box"])
-    with pytest.raises(InvalidInputError, match="may touch the body None"):
-        BodyPlaces(module, None, ["tip"])
+    refuse(InvalidInputError, "effectors: expected", BodyPlaces, module, "box", ["box"])
+    refuse(InvalidInputError, "may touch the body None", BodyPlaces, module, None, ["tip"])

@@ -69,7 +69,7 @@ def test_nothing_in_the_way_or_near_makes_no_constraints():
     assert obstacles.gap(x[:, :2]).isinf().all()
     assert placed((BALL, [9.0, 0.0, 0.0])).constraints(x) is None
     assert float(placed((Circle(0.1), [0.1, 0.2, 0.0])).body_gap(x[0, :3])) < -0.02  # inside the body
-    with pytest.raises(ShapeError, match=r"poses: expected \(1, 3\), got \(2, 3\)"):
+    with pytest.raises(ShapeError, match=r"poses: expected shape \(1, 3\), got \(2, 3\)"):
         obstacles.place([WALL], torch.zeros(2, 3, dtype=F64))
 
 

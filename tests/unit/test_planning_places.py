@@ -13,6 +13,7 @@ from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, PlanarTravel, Workspace
 from difflcs.planning.outline import DistanceGrid, clearance, ring
+from tests.conftest import refuse
 
 F64 = torch.float64
 RADIUS = 0.15
@@ -55,10 +56,8 @@ def test_the_length_of_a_ring_is_that_of_geometry():
 
 
 def test_a_ring_is_refused_where_there_is_none():
-    with pytest.raises(InvalidInputError, match="distance"):
-        ring(SHAPES["box"], 0.0, 10)
-    with pytest.raises(InvalidInputError, match="n_points"):
-        ring(SHAPES["box"], 0.1, 2)
+    refuse(InvalidInputError, "distance", ring, SHAPES["box"], 0.0, 10)
+    refuse(InvalidInputError, "n_points", ring, SHAPES["box"], 0.1, 2)
     with pytest.raises(InvalidInputError, match=r"shape: expected parts .* got 2 that are apart; take a larger"):
         ring(SHAPES["apart"], 0.09, 80)  # .2 between them
 
@@ -77,6 +76,7 @@ def test_discs_on_places_have_the_gap_and_are_at_rest(pose):
     system = PlanarPushing(TEE, RADIUS, drive=PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10))
     places = DiscPlaces(TEE, RADIUS, 40, gap=0.03)
     x = tensor([*pose, 5.0, 5.0, 1.0, -1.0])
+    refuse(ShapeError, r"places: expected shape \(n, 2\), got \(7,\); reshape it", places.states, x, x)
     states = places.states(x, places.sample(x))
     assert states.shape == (40, 7)
     torch.testing.assert_close(system.contacts(states).gap.amin(-1), torch.full((40,), 0.03, dtype=F64))
@@ -108,12 +108,9 @@ def test_bounds_of_the_workspace_hold_targets_inside():
 
 
 def test_a_workspace_that_is_none_is_refused():
-    with pytest.raises(InvalidInputError, match="low"):
-        Workspace((0.0, 1.0), (1.0, 1.0), step=0.1)
-    with pytest.raises(ShapeError, match="high"):
-        Workspace((0.0, 0.0), (1.0,), step=0.1)
-    with pytest.raises(InvalidInputError, match="step"):
-        Workspace((0.0, 0.0), (1.0, 1.0), step=0.0)
+    refuse(InvalidInputError, "low", Workspace, (0.0, 1.0), (1.0, 1.0), step=0.1)
+    refuse(ShapeError, "high", Workspace, (0.0, 0.0), (1.0,), step=0.1)
+    refuse(InvalidInputError, "step", Workspace, (0.0, 0.0), (1.0, 1.0), step=0.0)
 
 
 # --- travel -----------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from difflcs.errors import (
     NotPositiveDefiniteError,
     ShapeError,
 )
+from tests.conftest import refuse
 
 NAMES = ["A", "B", "C", "d", "D", "E", "F", "c"]
 
@@ -75,8 +76,7 @@ def test_one_system_has_no_index(build, sequence):
         with pytest.raises(IndexError, match=message) as caught:
             record[0]
         assert isinstance(caught.value, DiffLCSError)
-        with pytest.raises(BatchIndexError, match=message):
-            list(record)
+        refuse(BatchIndexError, message, list, record)
 
 
 @pytest.mark.parametrize("index", [4, -5, (0, 0), (0, ..., 0), torch.tensor([4]), "A", 1.0, torch.tensor([True] * 3)])
@@ -128,8 +128,7 @@ def test_a_stack_broadcasts_each_field_over_its_batch(build):
 
 
 def test_a_stack_refuses_what_does_not_fit(build):
-    with pytest.raises(InvalidInputError, match="expected at least one LCSParams, got none; give"):
-        LCSSequence.stack([])
+    refuse(InvalidInputError, "expected at least one LCSParams, got none; give", LCSSequence.stack, [])
     with pytest.raises(DTypeError, match=r"systems\[1\]: expected LCSParams, got LCSModel.*; build"):
         LCSSequence.stack([build.params(), build.model()])
     with pytest.raises(ShapeError, match=r"systems\[1\]: expected .*\(4, 2, 3\) like .*, got \(4, 2, 2\); a contact"):
@@ -140,10 +139,8 @@ def test_a_stack_refuses_what_does_not_fit(build):
 
 @pytest.mark.parametrize("k", [5, -6])
 def test_there_is_no_stage_beyond_the_horizon(sequence, k):
-    with pytest.raises(BatchIndexError, match=rf"k: expected a stage of 0 … 4, got {k}; choose"):
-        sequence.stage(k)
-    with pytest.raises(DTypeError, match="k: expected an int"):
-        sequence.stage(1.0)
+    refuse(BatchIndexError, rf"k: expected a stage of 0 … 4, got {k}; choose", sequence.stage, k)
+    refuse(DTypeError, "k: expected an int", sequence.stage, 1.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -151,8 +148,7 @@ def test_every_field_needs_its_stages(build, name):
     tensors = sequence_tensors(build)
     short = {**tensors, name: tensors[name][:4]}
     match = "expected shape" if name == "A" else rf"{name}: expected shape \(\.\.\., H=5, .*, got \(4, .*; reshape"
-    with pytest.raises(ShapeError, match=match):
-        LCSSequence(**short)
+    refuse(ShapeError, match, LCSSequence, **short)
     with pytest.raises(ShapeError, match=rf"{name}: expected a (matrix|vector) \(\.\.\., H, .*; add the missing"):
         LCSSequence(**{**tensors, name: tensors[name][0]})
 
@@ -169,13 +165,12 @@ def test_the_numbers_of_every_stage_are_checked(build):
         LCSSequence(**tensors)
     tensors = sequence_tensors(build, 3)
     tensors["E"][2, 0, 0] = torch.nan
-    with pytest.raises(NonFiniteError, match=r"E: expected finite numbers, got 1 .* at index \(2, 0, 0\)"):
-        LCSSequence(**tensors)
+    refuse(NonFiniteError, r"E: expected finite numbers, got 1 .* at index \(2, 0, 0\)", LCSSequence, **tensors)
 
 
 def test_a_sequence_wants_one_action_a_stage(build, sequence):
     n = build.normal(0)
-    with pytest.raises(ShapeError, match=r"u_seq: expected shape \(\.\.\., H=5, n_u=2\), got \(4, 2\); give one"):
+    with pytest.raises(ShapeError, match=r"u_seq: expected shape \(\.\.\., T=5, n_u=2\), got \(4, 2\); give one"):
         sequence.rollout(n(4), n(4, 2))
     with pytest.raises(ShapeError, match=r"x0: its batch dimensions|u_seq: its batch dimensions \(2,\).*x0 \(3,\)"):
         sequence.rollout(n(3, 4), n(2, 5, 2))

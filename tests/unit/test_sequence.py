@@ -8,6 +8,7 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position
+from tests.conftest import refuse
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>
@@ -143,10 +144,8 @@ def test_a_context_holds_for_all_stages():
 
 def test_refuses_what_passes_cannot_do():
     cost = GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=1.0)
-    with pytest.raises(InvalidInputError, match="passes: expected"):
-        LCSMPCLayer(Drift(), cost, 3, passes=0)
-    with pytest.raises(InvalidInputError, match="passes=1"):
-        LCSMPCLayer(Drift(), cost, 3, passes=2).controller()
+    refuse(InvalidInputError, "passes: expected", LCSMPCLayer, Drift(), cost, 3, passes=0)
+    refuse(InvalidInputError, "passes=1", LCSMPCLayer(Drift(), cost, 3, passes=2).controller)
     staged = Drift(lambda system: LCSSequence.stack([system] * 3))
     with pytest.raises(DTypeError, match="expected LCSParams from Drift"):
         LCSMPCLayer(staged, cost, 3, passes=2)(vector(0.0), vector(0.0), context=vector(0.5))

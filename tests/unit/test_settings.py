@@ -16,6 +16,7 @@ from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_nam
 from difflcs.rl.runs.training import TrainConfig, count_episodes, count_goals_due
 from difflcs.rl.settings import Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
+from tests.conftest import refuse
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,7 @@ def test_bounds_that_are_reached(values):
 )
 def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
     name = next(iter(values))
-    with pytest.raises(InvalidInputError, match=rf"{name}: expected a finite .*{name}"):
-        kind(**values)
+    refuse(InvalidInputError, rf"{name}: expected a finite .*{name}", kind, **values)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +84,7 @@ def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
     ],
 )
 def test_values_of_another_type_are_refused_by_name(values):
-    with pytest.raises(DTypeError, match=next(iter(values))):
-        Outer(**values)
+    refuse(DTypeError, next(iter(values)), Outer, **values)
 
 
 def test_integers_stand_for_floats_and_none_where_it_is_declared():
@@ -109,11 +108,9 @@ def test_integers_stand_for_floats_and_none_where_it_is_declared():
 )
 def test_json_that_does_not_fit_is_refused(change, message):
     plain = json.loads(json.dumps(asdict(Outer())))
-    with pytest.raises(CheckpointError, match=message):
-        from_json({**plain, **change}, Outer)
+    refuse(CheckpointError, message, from_json, {**plain, **change}, Outer)
     del plain["size"]
-    with pytest.raises(CheckpointError, match="fields"):
-        from_json(plain, Outer)
+    refuse(CheckpointError, "fields", from_json, plain, Outer)
 
 
 def groups(kind: type[Any]) -> Iterator[type[Any]]:

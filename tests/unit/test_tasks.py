@@ -16,6 +16,7 @@ from difflcs.rl.rollout import PolicyOutput
 from difflcs.rl.runs.figures import record_video
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
+from tests.conftest import refuse
 
 TOY = make_task()
 
@@ -53,10 +54,8 @@ def test_environments_that_cannot_be_made_say_why():
         (make_task(env_kwargs={"color": "red"}), "color"),
     ):
         for make in (task.make_env, lambda task=task: task.make_envs(2)):
-            with pytest.raises(InvalidInputError, match=f"task toy: its environment cannot be made.*{why}"):
-                make()
-    with pytest.raises(MissingDependencyError, match="no_such_package"):
-        make_task(requires=("no_such_package",)).make_env()
+            refuse(InvalidInputError, f"task toy: its environment cannot be made.*{why}", make)
+    refuse(MissingDependencyError, "no_such_package", make_task(requires=("no_such_package",)).make_env)
 
 
 @pytest.mark.parametrize(
@@ -68,8 +67,7 @@ def test_environments_that_cannot_be_made_say_why():
     ],
 )
 def test_an_environment_that_would_clip_what_is_planned_is_refused(change, message):
-    with pytest.raises(InvalidInputError, match=message):
-        make_task(**change).make_envs(2)
+    refuse(InvalidInputError, message, make_task(**change).make_envs, 2)
     make_task(u_max=U_MAX / 2).make_envs(2).close()  # narrower ones are executed as planned
 
 
@@ -137,8 +135,7 @@ def test_what_a_picture_says():
     ],
 )
 def test_bad_values_are_refused(change, error, message):
-    with pytest.raises(error, match=message):
-        make_task(**change)
+    refuse(error, message, make_task, **change)
 
 
 def test_a_registered_task_is_found_and_replaced_by_its_name():
@@ -153,8 +150,7 @@ def test_a_registered_task_is_found_and_replaced_by_its_name():
 
 
 def test_what_is_no_task_is_not_registered():
-    with pytest.raises(DTypeError, match="TaskSpec"):
-        register_task({"name": "x"})
+    refuse(DTypeError, "TaskSpec", register_task, {"name": "x"})
 
 
 @pytest.mark.parametrize("name", ["no-such-task", "", "a" * 1000])

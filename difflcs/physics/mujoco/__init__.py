@@ -5,9 +5,7 @@ from difflcs.errors import MissingDependencyError
 try:
     import mujoco as _mujoco  # noqa: F401  the files below import it
 except ImportError as error:
-    raise MissingDependencyError(
-        'expected the package mujoco, not installed; run: pip install "difflcs[envs]"'
-    ) from error
+    raise MissingDependencyError('expected the package mujoco, got none; run: pip install "difflcs[envs]"') from error
 
 from difflcs.physics.mujoco.cost import Distance, Effort, MujocoCost, Orientation, Position, Posture, Velocity
 from difflcs.physics.mujoco.groups import ContactGroup

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from difflcs._checks import describe
+from difflcs._checks import check_list, describe
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
@@ -364,13 +364,18 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
 def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
     """Return the pairs (ngeom, ngeom) that the caller named."""
     allowed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    for pair in pairs:
-        if isinstance(pair, str) or len(pair) != 2:
-            raise InvalidInputError(f'pairs: expected pairs such as ("finger", "box"), got {describe(pair)}; give two')
-        first, second = (find_geoms(model, name) for name in pair)
+    for pair in check_list("pairs", pairs, 'give pairs such as [("finger", "box")]'):
+        first, second = (find_geoms(model, name) for name in check_pair("pairs", pair))
         allowed[np.ix_(first, second)] = allowed[np.ix_(second, first)] = True
     weld = model.body_weldid[model.geom_bodyid]
     return allowed & (weld[:, None] != weld[None])
+
+
+def check_pair(name: str, pair: Any) -> Any:
+    """Refuse anything but two of something."""
+    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
+        raise InvalidInputError(f'{name}: expected pairs such as ("finger", "box"), got {describe(pair)}; give two')
+    return pair
 
 
 def find_geoms(model: Any, name: int | str) -> list[int]:
@@ -380,7 +385,7 @@ def find_geoms(model: Any, name: int | str) -> list[int]:
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         geoms = [geom] if geom >= 0 else [g for g in range(model.ngeom) if model.geom_bodyid[g] == body >= 0]
     else:
-        geoms = [name] if 0 <= name < model.ngeom else []
+        geoms = [int(name)] if isinstance(name, int | np.integer) and 0 <= name < model.ngeom else []
     if not geoms:
         raise InvalidInputError(
             f"pairs: expected names of geoms or bodies, or numbers of geoms below {model.ngeom}, got {name!r:.100}; "

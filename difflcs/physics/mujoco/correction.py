@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from difflcs._checks import broadcast_batch, check_shape, check_tensor
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
@@ -71,6 +72,9 @@ class WholeStep:
 
         None where MuJoCo warns or raises. `control` converts actions at states.
         """
+        check_tensor("x", x, [("n_x", state.n_x)])
+        check_shape("u", u, "... H n_u", {"n_u": self.model.nu})
+        x = x.expand(*broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-2])]), state.n_x)
         found, states = [x.detach()], state.flatten(x, np.zeros(0))
         to = state.nq, state.nq + state.nv
         for action in u.detach().unbind(-2)[:-1]:

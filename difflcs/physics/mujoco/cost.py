@@ -12,10 +12,20 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_array, check_kind, check_number, check_tensor, describe, did_you_mean
+from difflcs._checks import (
+    broadcast_batch,
+    check_array,
+    check_kind,
+    check_list,
+    check_number,
+    check_shape,
+    check_tensor,
+    describe,
+    did_you_mean,
+)
 from difflcs._fields import TensorFields
 from difflcs.cost import QuadraticCost
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco.lcs import MujocoLCS
 from difflcs.physics.mujoco.state import cross
 
@@ -152,9 +162,7 @@ class MujocoCost(TensorFields):
         super().__init__()
         check_kind("module", module, MujocoLCS, "pass the one of the system")
         if not isinstance(terms, Sequence) or not terms:
-            raise DTypeError(
-                f"terms: expected a list of Position, Orientation, …, got {describe(terms)}; give one at least"
-            )
+            raise DTypeError(f"terms: expected a list of Position, Orientation, …, got {describe(terms)}; give some")
         self.n_x, self.n_u = module.n_x, module.n_u
         self._scene = _Scene(module)
         rows = [self._scene.bind(f"terms[{k}] {type(term).__name__}", term) for k, term in enumerate(terms)]
@@ -224,14 +232,15 @@ class MujocoCost(TensorFields):
         Raises:
             InvalidInputError and its kinds: an argument does not fit.
         """
-        columns, model, x = self._scene.dofs("joints", joints), self._scene._model, x.clone()
+        columns, model, margin = self._scene.dofs("joints", joints), self._scene._model, check_number("margin", margin)
+        given, x = x, check_tensor("x", x, [("n_x", self.n_x)]).to("cpu", torch.float64, copy=True)
         numbers = model.dof_jntid[columns]
         limited, turns = model.jnt_limited[numbers, None], model.jnt_type[numbers] == int(mujoco.mjtJoint.mjJNT_HINGE)
         low, high = torch.from_numpy(
             np.where(limited, model.jnt_range[numbers] + [margin, -margin], [-np.inf, np.inf])
         ).T
         most = torch.from_numpy(np.where(turns, _TURN_STEP, np.inf))
-        for _ in range(_STEPS):
+        for _ in range(_STEPS if columns else 0):
             near, at = self.at(x, goal), x[..., columns]
             slope = ((near.Q @ x.unsqueeze(-1)).squeeze(-1) + near.q)[..., columns]
             curve = near.Q[..., columns, :][..., columns]
@@ -243,7 +252,7 @@ class MujocoCost(TensorFields):
             x[..., columns] = (at + step).clamp(low, high)
             if float(step.abs().max()) < 1e-4:
                 break
-        return x
+        return x.to(given)
 
     def _check_goal(self, goal: Tensor | None) -> list[Tensor]:
         """The goal of a call, if there is to be one."""
@@ -332,11 +341,8 @@ class _Row(NamedTuple):
         """The same with its goal as an array."""
         if self.goal is None:
             return self
-        goal = check_array(f"{self.about}: goal", self.goal).copy()
-        if goal.shape != (self.n_goal,):
-            raise ShapeError(f"{self.about}: expected a goal of shape ({self.n_goal},), got {goal.shape}; see the term")
-        if not np.isfinite(goal).all():
-            raise NonFiniteError(f"{self.about}: expected a finite goal, got {goal.tolist()}; find where it comes from")
+        goal = check_array(f"{self.about}: goal", self.goal)
+        check_shape(f"{self.about}: goal", torch.from_numpy(goal), str(self.n_goal), remedy="see the term")
         return self._replace(goal=goal)
 
 
@@ -396,10 +402,8 @@ class _Scene:
             if turning or ends[j + 1] - ends[j] == 1
         }
         names = list(known) if names is None else [names] if isinstance(names, str) else names
-        if not isinstance(names, Sequence):
-            raise DTypeError(f"{about}: expected names of joints, got {describe(names)}; list them, or leave them out")
-        for name in names:
-            if name not in known:
+        for name in (names := check_list(about, names, "name joints, or leave them out")):
+            if not isinstance(name, str) or name not in known:
                 raise _unknown(about, "joint" if turning else "slide or hinge", known, name)
         return [dof for name in names for dof in known[name]]
 
@@ -413,7 +417,7 @@ class _Scene:
         state, model, data, source = self._module.state, self._model, self._data, self._module._data
         qpos = state.to_mujoco(x)[0].reshape(-1, state.nq)
         flat, nv, n, count = x.detach().double().cpu().numpy(), state.nv, len(qpos), len(self.frames)
-        batch, flat = flat.shape[:-1], flat.reshape(n, -1)
+        batch, flat = flat.shape[:-1], flat.reshape(n, flat.shape[-1])
         place, turn, moves = np.empty((n, count, 3)), np.empty((n, count, 9)), np.empty((n, count, 2, 3, nv))
         turns, turning = np.zeros((n, count, 4)), {row.where[0] for row in rows if row.kind == _TURN}
         data.mocap_pos[:], data.mocap_quat[:] = source.mocap_pos, source.mocap_quat

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from difflcs._checks import check_number, check_positive_int, describe
+from difflcs._checks import check_kind, check_list, check_number, check_positive_int, describe
 from difflcs.errors import InvalidInputError
-from difflcs.physics.mujoco.contacts import Budget, find_geoms
+from difflcs.physics.mujoco.contacts import Budget, check_pair, find_geoms
 
 Array = NDArray[np.float64]
 
@@ -51,9 +51,10 @@ class ContactSelection:
             )
         self.group = np.full((model.ngeom, model.ngeom), -1)
         for i, group in enumerate(groups):
-            for one in [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of:
+            of = [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of
+            for one in check_list("of of a group", of, "name geoms or bodies"):
                 mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-                sides = one if isinstance(one, tuple) else (one, None)
+                sides = check_pair("of of a group", one) if isinstance(one, tuple) else (one, None)
                 mine[np.ix_(*(_geoms(model, side) for side in sides))] = True
                 self.group[(mine | mine.T) & (self.group < 0)] = i
         self.budgets = [
@@ -63,7 +64,7 @@ class ContactSelection:
                 distance
                 if group.distance is None
                 else check_number("distance of a group", group.distance, strict=True),
-                bool(group.friction),
+                check_kind("friction of a group", group.friction, bool, "give True or False"),
             )
             for i, group in enumerate(groups)
         ]

@@ -129,7 +129,7 @@ class MujocoLCS:
         limits: int | None = None,
     ):
         options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
-        friction, torsion = _check_options(motion, cone, mobility, friction, torsion)
+        friction, torsion = _check_options(motion, cone, mobility, friction, torsion, relative)
         check_model(model, data, motion)
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
@@ -148,7 +148,7 @@ class MujocoLCS:
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
-        mobility = mobility if isinstance(mobility, str) else check_array("mobility", mobility).copy()
+        mobility = mobility if isinstance(mobility, str) else check_array("mobility", mobility)
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
@@ -463,13 +463,16 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
-def _check_options(motion: Any, cone: Any, mobility: Any, friction: Any, torsion: Any) -> tuple[float | None, bool]:
+def _check_options(
+    motion: Any, cone: Any, mobility: Any, friction: Any, torsion: Any, relative: Any
+) -> tuple[float | None, bool]:
     check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
     check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
     if isinstance(mobility, str):
         check_choice("mobility", mobility, ("inertia", "damping"))
     if friction is not None:
         friction = check_number("friction", friction)
+    check_kind("relative", relative, bool)
     return friction, check_kind("torsion", torsion, bool)
 
 
@@ -488,9 +491,7 @@ def _take(into: Any, data: Any) -> None:
     for name in TAKEN:
         field, values = getattr(into, name), getattr(data, name)
         if values.shape != field.shape:
-            raise InvalidInputError(
-                f"data: expected {name} {field.shape} of the model, got {values.shape}; pass MjData(model)"
-            )
+            raise InvalidInputError(f"data: expected {name} {field.shape}, got {values.shape}; pass MjData(model)")
         if not np.isfinite(values).all():
             raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
         field[:] = values

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from difflcs._checks import broadcast_batch, did_you_mean
+from difflcs._checks import broadcast_batch, check_tensor, did_you_mean
 from difflcs._differentiation import Solver, runs_eagerly, solve
 from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
@@ -199,8 +199,9 @@ class LearnableMujocoLCS(nn.Module):
         """
         if x is None:
             return self.physics.params(x, context)  # which says what is missing
+        check_tensor("x", x, [("n_x", self.n_x)])
         change = fresh(self, ("change",)).change
-        given = (change, x) if context is None else (change, x, context)
+        given = (change, x) if context is None else (change, x, check_tensor("context", context, [("n_u", self.n_u)]))
         return LCSParams(*solve(_Matrices(self, x.dtype, len(given)), *given))
 
     def summary(self) -> dict[str, list[float]]:

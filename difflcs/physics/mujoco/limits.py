@@ -117,7 +117,8 @@ class RowFinder:
         self.model, self.data = model, data
         disabled = model.opt.disableflags
         limits_act, rubs = (not disabled & flags("CONSTRAINT", name) for name in ("LIMIT", "FRICTIONLOSS"))
-        limits_act = limits_act and limits != 0
+        most = MOST_LIMITS if limits is None else check_positive_int("limits", limits, minimum=0)
+        limits_act = limits_act and most > 0
         limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE)) & limits_act
         self._joints = np.flatnonzero(limited & (model.jnt_type >= _SLIDE))
         self._balls = np.flatnonzero(limited & (model.jnt_type == _BALL))
@@ -129,7 +130,6 @@ class RowFinder:
         joints, tendons = np.concatenate([self._joints, self._balls]), self._tendons
         of_limits = len(joints) + len(tendons)
         self._warn = limits is None
-        most = MOST_LIMITS if limits is None else check_positive_int("limits", limits, minimum=0)
         self.n_limits = min(of_limits, most)
         self._range = np.concatenate([model.jnt_range[joints], model.tendon_range[tendons]])
         self._range[len(self._joints) : len(joints), 0] = -np.inf  # balls have the largest angle alone

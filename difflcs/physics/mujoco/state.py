@@ -13,8 +13,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_array, check_kind, check_tensor
-from difflcs.errors import InvalidInputError, NonFiniteError, ShapeError
+from difflcs._checks import check_array, check_kind, check_shape, check_tensor
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.mujoco.native import check_readable
 
 Array = NDArray[np.float64]
@@ -198,10 +198,7 @@ class MujocoState:
     @staticmethod
     def _array(name: str, value: ArrayLike, size: int) -> Array:
         array = check_array(name, value)
-        if array.ndim == 0 or array.shape[-1] != size:
-            raise ShapeError(f"{name}: expected shape (..., {size}), got {array.shape}; take it from this model's data")
-        if not np.isfinite(array).all():
-            raise NonFiniteError(f"{name}: expected finite numbers, got NaN or infinity; find where they come from")
+        check_shape(name, torch.from_numpy(array), f"... {size}", remedy="take it from this model's data")
         return array
 
 

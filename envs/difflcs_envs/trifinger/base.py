@@ -109,9 +109,7 @@ class TriFingerEnv(GoalEnv):
                 'unset). Use render_mode="rgb_array".'
             )
         if render_mode not in (None, "rgb_array", "human"):
-            raise ValueError(
-                f'Expected render_mode None, "rgb_array" or "human", got {render_mode!r}. Choose one of them.'
-            )
+            raise ValueError(f'Expected render_mode None, "rgb_array" or "human", got {render_mode!r}. Choose one.')
         self.render_mode = render_mode
         self.object = scene_object
         self.task = checked_task(task, yaw_tolerance, sparse_penalty, reward_weights)
