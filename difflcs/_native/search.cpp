@@ -73,7 +73,7 @@ struct Shift {
   enum { all, begin, end } part;
   int64_t later;
 };
-constexpr int64_t kVaried = 8, kRounds = 4, kMostRounds = 32;
+constexpr int64_t kVaried = 8, kRounds = 4;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
 // The other rounds draw. Half of their variations have a little noise and follow a homotopy from softer contact, ten to
@@ -82,8 +82,9 @@ constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::a
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
-// It ends when kRounds in a row have not made the cost smaller by the part kGain. With fewer starts than kVaried there
-// is one round, of three shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
+// It ends when kRounds in a row, or a quarter of the starts' number if that is more, have not made the cost smaller by
+// the part kGain; after eight times as many in any case. With fewer starts than kVaried there is one round, of three
+// shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
 constexpr double kGain = 1e-3;
 constexpr int64_t kFewVaried = 4, kSoftest = kVaried + 1;
 
@@ -355,7 +356,6 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
 // Runs jobs [first, first + count) to the point where starts are compared.
 void MpcSearch::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                         bool guessed) {
-  const Sizes n(batch);
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data() + first;
@@ -603,7 +603,8 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
   const Sizes n(batch);
   idle.assign(count, 0);
   const bool few = effort.starts < kVaried;
-  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : kMostRounds;
+  const int64_t patience = std::max(kRounds, effort.starts / 4);
+  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * patience;
   const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
@@ -633,7 +634,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) idle[e] = -1;
       copy_plan(n, finished.plans(), i, out, e);
     }
-    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= kRounds; }), live.end());
+    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= patience; }), live.end());
   }
 }
 
