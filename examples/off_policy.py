@@ -43,7 +43,7 @@ from difflcs.rl.learning.state_tree import initialise_moments, load_moments, mom
 from difflcs.rl.learning.surrogate import OUTLIER_KL, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.warmup import WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import Work
-from difflcs.rl.methods.phases import short_warmup, warmup_phase
+from difflcs.rl.methods.phases import warmup_phase
 from difflcs.rl.rollout import (
     append_episodes,
     elapsed_fractions,
@@ -333,7 +333,7 @@ class SACMethod(LCSMethod):
     def smoke(self) -> Self:
         """See `Method`."""
         few = {"episodes": 3, "rounds": 1, "imagined": 4, "first": 20, "critic_steps": 5, "actor_steps": 1}
-        return replace(self, warmup_minutes=0.2, warmup=short_warmup(self.warmup), **few)
+        return replace(super().smoke(), **few)
 
 
 if __name__ == "__main__":

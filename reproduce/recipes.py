@@ -1,5 +1,7 @@
 """The recipes: what each changes of a method's settings and of its task. Ours changes nothing: it is the default.
 
+But in all of them the newest policy of PPO is handed out, with no test, see `units.schedule_of`.
+
 Names and labels of all of them are here, so that a change of the paper's recipe is one change in one place.
 """
 

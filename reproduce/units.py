@@ -190,7 +190,8 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
 
 def schedule_of(unit: Unit, preset: Preset) -> TrainConfig:
     """Build the settings of a unit with all evaluations."""
-    method, preset = changed(get_method(unit.method)(), unit.changes.settings), preset.of(unit.method)
+    newest = changed(get_method(unit.method)(), {"ppo": {"gain": None}})  # as in the paper, whatever the recipe
+    method, preset = changed(newest, unit.changes.settings), preset.of(unit.method)
     return TrainConfig(
         task=unit.task,
         method=method.smoke() if preset.smoke else method,

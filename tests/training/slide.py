@@ -125,7 +125,7 @@ def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
 
 def small_settings(**changes: Any) -> PPOSettings:
     critic = CriticSettings(epochs=Epochs(first=10, each=3, minibatch=256))
-    return replace(PPOSettings(rollouts=ROLLOUTS, steps=4, std=0.03, critic=critic), **changes)
+    return replace(PPOSettings(rollouts=ROLLOUTS, steps=4, std=0.03, critic=critic, gain=None), **changes)
 
 
 def slide_actor(settings: PPOSettings, lcs: LCSModel | None = None) -> GaussianPolicy:

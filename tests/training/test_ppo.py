@@ -18,9 +18,7 @@ from tests.training.slide import (
     Slide,
     features,
     make_envs,
-    make_model,
     make_models,
-    make_mpc,
     make_ppo,
     parameters,
     recorded,
@@ -56,10 +54,10 @@ def test_ppo_learns():
 
 def test_a_start_is_replaced_by_what_is_better_and_by_nothing_else():
     """What is handed out is the start, then what played when it was accepted; the learner goes its own way."""
-    settings = small_settings(rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6)
+    settings = small_settings(rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, gain=1.65)
     trainer = ppo_settings.make_ppo(
         slide_actor(settings), make_envs(40), settings, 0, features=features, total_episodes=200, episode_steps=STEPS,
-        failure_penalty=10.0, best=make_mpc(make_model()),
+        failure_penalty=10.0,
     )  # fmt: skip
     expected, accepted = parameters(trainer), []
     while not trainer.done:
@@ -70,6 +68,16 @@ def test_a_start_is_replaced_by_what_is_better_and_by_nothing_else():
         assert not same(list(trainer.actor.learned.state_dict().values()), playing)
     assert not accepted[0]
     assert any(accepted)
+
+
+def test_what_no_episode_tests_is_handed_out_if_it_is_near():
+    """Model rollouts after the last real episodes: `max_kl` bounds how far they may lead from what was accepted."""
+    for bound in (1e9, 0.0):
+        trainer = make_ppo(iterations=2, models=make_models(last=2), gain=-100.0)
+        trainer.step()
+        trainer.max_kl = bound
+        assert trainer.step().accepted
+        assert same(parameters(trainer), list(trainer.actor.learned.state_dict().values())) is bool(bound)
 
 
 def test_the_policy_explores_and_the_environment_gets_clipped_actions():

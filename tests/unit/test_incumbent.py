@@ -1,5 +1,7 @@
 """A policy is replaced only by what did better, as far as few episodes can tell."""
 
+from types import SimpleNamespace
+
 import torch
 from torch import nn
 
@@ -15,25 +17,26 @@ def drawn(seed, count, mean=0.0, failing=0):
     return values
 
 
-def make(failure):
+def make(failure, errors=1.65):
     """A line that is handed out, and another one that learns."""
-    return Incumbent(lambda *_, **__: None, nn.Linear(1, 1), nn.Linear(1, 1), failure, 1)  # pyright: ignore
+    best, learner = (SimpleNamespace(controller=None, learned=nn.Linear(1, 1)) for _ in range(2))
+    return Incumbent(best, learner, failure, errors, 1)  # pyright: ignore
 
 
 def test_a_better_policy_passes_and_what_is_as_good_rarely_does():
-    assert is_better(drawn(0, 30), drawn(1, 30, failing=15), 5.0)
-    assert not is_better(drawn(0, 30, failing=15), drawn(1, 30), 5.0)
-    passed = sum(is_better(drawn(k, 30), drawn(1000 + k, 30), 0.0) for k in range(400))
+    assert is_better(drawn(0, 30), drawn(1, 30, failing=15), 5.0, 1.65)
+    assert not is_better(drawn(0, 30, failing=15), drawn(1, 30), 5.0, 1.65)
+    passed = sum(is_better(drawn(k, 30), drawn(1000 + k, 30), 0.0, 1.65) for k in range(400))
     assert 4 < passed < 40  # 5 %
-    assert not is_better(drawn(0, 1, mean=9.0), drawn(1, 30), 0.0)  # one episode tells nothing
+    assert not is_better(drawn(0, 1, mean=9.0), drawn(1, 30), 0.0, 1.65)  # one episode tells nothing
 
 
 def test_a_failure_that_was_not_seen_counts():
     """A small gain in all of 30 episodes is no proof against rare failures; in 3000 it is."""
-    few, many = (is_better(drawn(0, count, mean=0.1), drawn(1, count), 2.0) for count in (30, 3000))
+    few, many = (is_better(drawn(0, count, mean=0.1), drawn(1, count), 2.0, 1.65) for count in (30, 3000))
     assert not few
     assert many
-    assert is_better(drawn(0, 30, mean=0.1), drawn(1, 30), 0.0)
+    assert is_better(drawn(0, 30, mean=0.1), drawn(1, 30), 0.0, 1.65)
 
 
 def test_starts_are_judged_by_what_was_expected_of_them():
@@ -68,6 +71,21 @@ def test_several_iterations_count_together_and_its_state_goes_on():
             one.begin()
         outcomes.append(incumbent.challenge(*arguments))
         assert copied.challenge(*arguments) is outcomes[-1]
-        assert len(copied) == len(incumbent)
+        assert len(copied.episodes) == len(incumbent.episodes)
     assert not outcomes[0]
     assert any(outcomes)
+
+
+def test_unless_it_is_worse_a_policy_passes_but_many_small_losses_do_not():
+    def passed(mean):
+        return sum(is_better(drawn(k, 30, mean), drawn(1000 + k, 30), 0.0, -1.65) for k in range(400)) / 400
+
+    assert 0.9 < passed(0.0) < 0.99 < passed(0.05)
+    assert passed(-0.2) == 0.0
+    incumbent, starts = make(0.0, -1.65), torch.zeros(30, 1, dtype=F64)
+    accepted = []
+    for k in range(12):
+        incumbent.begin()
+        accepted.append(incumbent.challenge(starts, drawn(k, 30, -0.02 * k), lambda inputs: 0 * inputs.squeeze(-1)))
+    assert any(accepted)
+    assert not any(accepted[6:])

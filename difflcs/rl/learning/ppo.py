@@ -21,7 +21,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
 from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic
-from difflcs.rl.learning.incumbent import Incumbent
+from difflcs.rl.learning.incumbent import Incumbent, distance
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.state_tree import State
@@ -29,7 +29,7 @@ from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
 from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
-from difflcs.rl.tasks import Features, compute_features
+from difflcs.rl.tasks import Features, Outcome, compute_features
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -64,7 +64,7 @@ class PPOReport:
         gradient_seconds: wall time of gradients and steps.
         value_seconds: wall time of advantages and value network.
         model_seconds: wall time of all model rollouts: the ensemble's training, episodes, solves, gradients.
-        accepted: 1 if its policy is handed out: always, but where a better one stays (0), see `Incumbent`.
+        accepted: 1 if its policy is handed out, 0 if an earlier one stays, see `Incumbent`.
     """
 
     iteration: int
@@ -138,7 +138,7 @@ class PPO(Trainer):
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks, besides the robot's own; None: real episodes alone, as in the paper.
         practice: source of model rollouts, if there are models.
-        incumbent: holds the model to hand out, in place of the actor's; the first episodes are those of the start.
+        incumbent: holds the model to hand out, in place of the actor's.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -193,15 +193,24 @@ class PPO(Trainer):
         return self.iteration - self.first_iteration >= len(self.sizes)
 
     def remember(self, episodes: TensorDict) -> None:
-        """Add earlier real episodes, such as those of a warm-up, to the data of the model rollouts."""
-        if self.models is not None:
-            self.models.add(episodes)
+        """Add earlier real episodes, such as those of a warm-up, to the data of the model rollouts.
+
+        The newest ones tell how good the start is, unless nothing but what is certainly better may replace it.
+        """
+        if self.models is None:
+            return
+        self.models.add(episodes)
+        if self.incumbent is not None and self.incumbent.errors < 0:
+            newest = episodes[-self.sizes[0] :]
+            rewards = self.scale(*_judge(self.models.env.outcome, newest))
+            self.incumbent.challenge(_inputs(self.features, newest)[:, 0], rewards.sum(1), self.critic.values)
 
     def step(self, after_step: AfterStep | None = None) -> PPOReport:
         """One iteration: collect, estimate advantages, improve the policy, fit the value network.
 
         Iterations on model rollouts come first, if there are models with real episodes. More of them follow the last
-        real episodes where the settings say so, unless only what the robot has tried may be handed out.
+        real episodes where the settings say so. The robot does not try what they teach, so it is handed out only where
+        `max_kl` bounds how far it is from what was tried and accepted, in the states of the newest episodes.
 
         Raises:
             InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
@@ -230,16 +239,18 @@ class PPO(Trainer):
         kept = self.incumbent
         accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
         self.iteration += 1
-        if self.done and self.models is not None and kept is None:
+        if self.done and self.models is not None:
             start = time.perf_counter()
             for k in range(self.models.settings.last):
                 model_success, model_loss = self._train_on_models(scale, 1 + k * self.models.settings.iterations)
+            if kept is not None and accepted and distance(self.actor, episodes[episodes["stable"]]) <= self.max_kl:
+                kept.learned.load_state_dict(kept.learner.state_dict())
             model_seconds += time.perf_counter() - start
         return PPOReport(
             iteration=self.iteration,
             env_steps=self.env_steps,
             success=float(episodes["success"].double().mean()),
-            mean_return=outcome.mean_return,
+            mean_return=float(outcome.returns.mean()) / self.scale.factor,
             kl=improvement.kl,
             learning_rate=step_size,
             std=std,
@@ -266,7 +277,7 @@ class PPO(Trainer):
         Iterations are numbered from `first`. Both are None if there are no models, or no real episodes in them yet.
         """
         models = self.models
-        unknown = self.incumbent is not None and not len(self.incumbent)
+        unknown = self.incumbent is not None and not self.incumbent.episodes
         if unknown or models is None or self.practice is None or not (len(models) and models.settings.iterations):
             return None, None
         settings = models.settings
@@ -302,17 +313,8 @@ class PPO(Trainer):
         start = time.perf_counter()
         self.critic.learn(inputs, estimate.rewards, key(Stream.VALUE), source.value_epochs)
         value_seconds += time.perf_counter() - start
-        return _Outcome(
-            episodes=episodes,
-            improvement=improvement,
-            starts=inputs[:, 0],
-            returns=rewards.sum(1),
-            mean_return=float(rewards.sum(1).mean()) / self.scale.factor,
-            explained_variance=1 - float(unexplained),
-            physics_seconds=physics_seconds,
-            solve_seconds=solve_seconds,
-            value_seconds=value_seconds,
-        )
+        explained, seconds = 1 - float(unexplained), (physics_seconds, solve_seconds, value_seconds)
+        return _Outcome(episodes, improvement, inputs[:, 0], rewards.sum(1), explained, *seconds)
 
     def _collect(
         self, env: VectorEnv, seeds: list[int], key: Sequence[int], after_step: AfterStep | None
@@ -351,14 +353,10 @@ class PPO(Trainer):
     ) -> _Improvement:
         """Take gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
         outcome = _Improvement()
-        policy: Any = episodes["policy"].flatten(0, 1)
-        # Only the keys that a step needs: to index all that the policy has written would cost as much as the loss.
-        data = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
+        data = _step_data(self.actor, episodes["policy"].flatten(0, 1))
         samples = cast("TensorDict", samples.flatten(0, 1))
         advantage = samples["advantage"]
         samples["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
-        if "plan" in policy.keys():
-            data["guess"] = policy["plan"].clone()  # the rollout's own optimum, then each step's
         rng = np.random.default_rng(key)
         start = time.perf_counter()
         self.update.measure(data, rng)
@@ -406,10 +404,9 @@ class PPO(Trainer):
     def load_state_dict(self, state: State) -> None:
         """See `Trainer`."""
         super().load_state_dict(state)
-        gaussian = self.actor.gaussian
         with torch.no_grad():
-            for parameter, name in ((gaussian.log_std, "log_std"), (gaussian.mixing, "mixing")):
-                parameter.copy_(state["covariance"][name])
+            for name, value in state["covariance"].items():
+                getattr(self.actor.gaussian, name).copy_(value)
         self.critic.load_state_dict(state["critic"])
         self.update.load_state_dict(state["update"])
         if self.models is not None:
@@ -440,7 +437,6 @@ class _Outcome:
     improvement: _Improvement
     starts: Tensor
     returns: Tensor
-    mean_return: float
     explained_variance: float
     physics_seconds: float
     solve_seconds: float
@@ -456,6 +452,23 @@ def _inputs(features: Features, episodes: TensorDict) -> Tensor:
     context = episodes.get(CONTEXT, None)
     context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
     return compute_features(features, states, goals, elapsed, context)
+
+
+def _judge(outcome: Outcome, episodes: Any) -> tuple[Tensor, Tensor]:
+    """(N, T) rewards and (N,) successes of episodes that are known without them."""
+    states, actions = episodes["state"], episodes["action"]
+    goals = episodes["goal"].unsqueeze(1).expand(-1, actions.shape[1], -1)
+    ended = torch.arange(1, actions.shape[1] + 1) == actions.shape[1]
+    rewards, successes = outcome(states[:, :-1], actions, states[:, 1:], goals, ended)
+    return rewards, successes[:, -1]
+
+
+def _step_data(actor: GaussianPolicy, policy: Any) -> TensorDict:
+    """Return only what a gradient step needs: to index all that the policy wrote would cost as much as the loss."""
+    data = policy.select(*actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
+    if "plan" in policy.keys():
+        data["guess"] = policy["plan"].clone()  # the rollout's own optimum, then each step's
+    return data
 
 
 def _batches(samples: int, steps: int, size: int | None, rng: np.random.Generator) -> Iterator[Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +12,6 @@ import torch
 from difflcs.errors import InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
-from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic, CriticSettings
 from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
@@ -27,7 +27,6 @@ from difflcs.rl.tasks import Features
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
-    from difflcs.mpc import LCSMPCLayer
     from difflcs.rl.learning.policy import GaussianPolicy
 
 
@@ -79,6 +78,9 @@ class PPOSettings(Settings):
     """Factor on all rewards: keeps values near one."""
     critic: CriticSettings = group(CriticSettings)
     """Settings of the value network."""
+    gain: float | None = bounded(-1.65, minimum=-100, maximum=100)
+    """Standard errors by which the newest real returns must exceed those of the best policy so far, for a policy to be
+    handed out; below 0: unless they fall short by more. None: the newest always is, as in the paper."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -100,12 +102,12 @@ def make_ppo(
     first_iteration: int = 0,
     failure_penalty: float = 0.0,
     models: ModelRollouts | None = None,
-    best: LCSMPCLayer | None = None,
 ) -> PPO:
     """Make PPO from its settings.
 
     Args:
-        actor: the policy, made with the deviation that the settings say.
+        actor: the policy, made with the deviation that the settings say. Unless `settings.gain` is None, a copy of it
+            learns, and it takes over what that has learned only where it may be handed out, see `Incumbent`.
         env: at least `settings.rollouts` environments in lockstep.
         settings: settings.
         seed: of noise, value network, goals and initial states.
@@ -117,8 +119,6 @@ def make_ppo(
         failure_penalty: part of the last reward of a failed episode, see `TaskSpec`.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Pass
             the episodes of a warm-up to `PPO.remember`.
-        best: a policy with a copy of the actor's model, which is handed out in its place and takes over what the actor
-            learns only when that is better, see `Incumbent`. None: the actor's own, better or worse.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -157,9 +157,10 @@ def make_ppo(
             rollouts.value_epochs,
         )
     incumbent = None
-    if best is not None:
-        models_of = (check_learned(best.lcs, env), check_learned(actor.learned, env))
-        incumbent = Incumbent(best, *models_of, settings.reward_scale * failure_penalty, len(example))
+    if settings.gain is not None:
+        best, actor = actor, copy.deepcopy(actor)
+        failure = settings.reward_scale * failure_penalty
+        incumbent = Incumbent(best, actor, failure, settings.gain, len(example))
     betas = settings.adam.betas
     deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
     return PPO(

@@ -244,7 +244,9 @@ class Warmup(EpisodeTrainer):
             self.lcs.action_support.copy_(torch.stack(self.bounds))
         data, context = transitions(self.buffer), contexts(self.buffer)
         take_frame: Any = getattr(self.lcs, "take_frame", lambda *_: False)
-        first = take_frame(*data) or (self.iteration == 0 and not self.pretrained)
+        # A frame that is known is looked for again only when there are twice as many iterations.
+        known = getattr(self.lcs, "frame", None) is not None and self.iteration & (self.iteration - 1)
+        first = (not known and take_frame(*data)) or (self.iteration == 0 and not self.pretrained)
         epochs = self.settings.epochs.first if first else self.settings.epochs.each
         outcome = fit(self.lcs, *data, self.settings, epochs, self._minibatches, context=context)
         self.iteration += 1

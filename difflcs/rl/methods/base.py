@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import torch
@@ -49,6 +49,31 @@ class Work:
     total_episodes: int
     make_envs: Callable[[int], VectorEnv]
     init: LCSModel | None = None
+
+
+_FEW = {
+    "warmup_minutes": 0.2,
+    "fit_minutes": 0.2,
+    "rollouts": 3,
+    "first": 5,
+    "each": 2,
+    "steps": 2,
+    "iterations": 1,
+    "samples": 10,
+}
+"""Most that a smoke test has of a setting, in whichever group it is."""
+Group = TypeVar("Group", bound=Settings)
+
+
+def _few(settings: Group) -> Group:
+    """Limit the numbers in a group of settings, and in the groups within it."""
+    limited = {}
+    for name, value in vars(settings).items():
+        if isinstance(value, Settings):
+            limited[name] = _few(value)
+        elif name in _FEW and isinstance(value, int | float):
+            limited[name] = min(value, _FEW[name])
+    return replace(settings, **limited)
 
 
 @dataclass(frozen=True)
@@ -100,8 +125,8 @@ class Method(Settings, ABC):
         """
 
     def smoke(self) -> Self:
-        """Return a copy that runs in seconds: too little of everything to learn anything."""
-        return self
+        """Return a copy that runs in seconds: too little of everything, see `_FEW`, to learn anything."""
+        return _few(self)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.learning.trainer import Trainer, configuration
 from difflcs.rl.methods.base import Method, Work
-from difflcs.rl.methods.phases import main_phase, short_main, short_models
+from difflcs.rl.methods.phases import main_phase
 from difflcs.rl.settings import bounded, group
 from difflcs.rl.tasks import PhysicsSpec, TaskSpec, single_start_backend
 
@@ -33,12 +33,10 @@ class ContactMethod(Method):
     """Data of the fit [min]; what is left is that of PPO through the MPC."""
     fit: PhysicsFitSettings = group(PhysicsFitSettings)
     """Settings of the fit."""
-    ppo: PPOSettings = group(PPOSettings)
+    ppo: PPOSettings = group(PPOSettings, gain=1.65)
     """Settings of PPO."""
     models: ModelRolloutSettings = group(ModelRolloutSettings)
     """Settings of the model rollouts of PPO."""
-    keep_best: bool = True
-    """Whether what PPO learns replaces the policy so far only where it is better in the robot's own episodes."""
     backend: str = "batched"
     """MPC solver: batched, or ipopt, the reference."""
 
@@ -74,11 +72,7 @@ class ContactMethod(Method):
         if count == work.total_episodes:
             return fit
         return LCSRL(
-            fit,
-            count * task.episode_steps,
-            lambda episodes, iterations: main_phase(
-                work, policy, self.ppo, self.models, episodes, iterations, self.keep_best
-            ),
+            fit, count * task.episode_steps, lambda *begun: main_phase(work, policy, self.ppo, self.models, *begun)
         )
 
     def rebuild(
@@ -99,16 +93,6 @@ class ContactMethod(Method):
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
         """See `Method`: the MPC as `PhysicsSpec` says."""
         return task.make_policy(learned, single_start_backend(self.backend), known_physics(task))
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        return replace(
-            self,
-            fit_minutes=min(self.fit_minutes, 0.2),
-            fit=replace(self.fit, rollouts=min(self.fit.rollouts, 3), steps=min(self.fit.steps, 3)),
-            ppo=short_main(self.ppo),
-            models=short_models(self.models),
-        )
 
 
 def _nearly_equal(one: Any, other: Any) -> bool:

@@ -3,20 +3,18 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from difflcs.rl.learning.ppo import PPO
-from difflcs.rl.methods.base import Work
-from difflcs.rl.methods.phases import main_phase
+from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.methods.ppo import PPOMethod
+from difflcs.rl.settings import group
 
 
 @dataclass(frozen=True)
 class ImproveMethod(PPOMethod):
     """PPO from the model of --init, which it replaces only where it is better in the robot's own episodes."""
 
+    ppo: PPOSettings = group(PPOSettings, gain=1.65)
+    """Settings of PPO."""
+
     name: ClassVar[str] = "improve"
     version: ClassVar[int] = 1
     summary: ClassVar[str] = "PPO from the model of --init, which only a better one replaces"
-
-    def trainer(self, work: Work) -> PPO:
-        """See `Method`."""
-        return main_phase(work, self.policy(work.task, self.initial(work)), self.ppo, self.models, keep_best=True)

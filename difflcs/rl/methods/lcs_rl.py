@@ -1,7 +1,7 @@
 """The method lcs-rl: the warm-up, and then PPO through the MPC."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.lcsrl import LCSRL
@@ -11,7 +11,7 @@ from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.learning.warmup import WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import LCSMethod, Work
-from difflcs.rl.methods.phases import main_phase, short_main, short_models, short_warmup, warmup_phase
+from difflcs.rl.methods.phases import main_phase, warmup_phase
 from difflcs.rl.settings import bounded, group
 
 
@@ -50,14 +50,4 @@ class LCSRLMethod(LCSMethod):
             warmup_phase(work, lcs, policy, self.warmup),
             round(self.warmup_minutes * work.task.steps_per_minute),
             lambda *begun: main_phase(work, policy, self.ppo, self.models, *begun),
-        )
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        return replace(
-            self,
-            warmup_minutes=min(self.warmup_minutes, 0.2),
-            warmup=short_warmup(self.warmup),
-            ppo=short_main(self.ppo),
-            models=short_models(self.models),
         )

@@ -1,8 +1,8 @@
 """The method pddm: networks that predict, and a planner that samples actions."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -10,7 +10,6 @@ from difflcs.errors import CheckpointError
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.pddm import PDDM, PDDMReport, PDDMSettings, Planner
 from difflcs.rl.methods.base import Method, Work
-from difflcs.rl.methods.phases import few_rollouts, short_epochs
 from difflcs.rl.settings import group
 from difflcs.rl.tasks import TaskSpec
 
@@ -52,16 +51,3 @@ class PDDMMethod(Method):
     def policy(self, task: TaskSpec, learned: Ensemble) -> Planner:
         """See `Method`."""
         return Planner(learned, task.make_cost(), self.pddm, *task.bounds)
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        ensemble, settings = self.pddm.ensemble, self.pddm
-        return replace(
-            self,
-            pddm=replace(
-                settings,
-                rollouts=few_rollouts(settings.rollouts),
-                samples=min(settings.samples, 10),
-                ensemble=replace(ensemble, epochs=short_epochs(ensemble.epochs, 2, 2)),
-            ),
-        )

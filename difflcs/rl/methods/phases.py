@@ -1,7 +1,4 @@
-"""The phases that several methods share, and short versions of their settings for smoke tests."""
-
-import copy
-from dataclasses import replace
+"""The phases that several methods share."""
 
 from difflcs.mpc import LCSMPCLayer
 from difflcs.records import LCSModule
@@ -12,7 +9,6 @@ from difflcs.rl.learning.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.learning.warmup import Warmup, WarmupSettings
 from difflcs.rl.methods.base import Work
 from difflcs.rl.rollout import Policy
-from difflcs.rl.settings import Epochs, Rollouts
 
 
 def warmup_phase(work: Work, lcs: LCSModule, policy: Policy, settings: WarmupSettings) -> Warmup:
@@ -28,12 +24,8 @@ def main_phase(
     models: ModelRolloutSettings | None,
     first_episode: int = 0,
     first_iteration: int = 0,
-    keep_best: bool = False,
 ) -> PPO:
-    """Make PPO from its settings, to continue after earlier episodes and iterations.
-
-    With `keep_best` it moves a copy of the controller, which itself changes only for the better, see `Incumbent`.
-    """
+    """Make PPO from its settings, to continue after earlier episodes and iterations."""
     # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
     from difflcs.rl.learning.policy import make_actor
 
@@ -42,9 +34,8 @@ def main_phase(
     rollouts = None
     if models is not None and models.iterations:
         rollouts = ModelRollouts(envs, task.outcome, models, work.seed, task.episode_steps)
-    best = controller if keep_best and isinstance(controller, LCSMPCLayer) else None
     return make_ppo(
-        make_actor(controller if best is None else copy.deepcopy(best), settings.std, settings.covariance),
+        make_actor(controller, settings.std, settings.covariance),
         envs,
         settings,
         work.seed,
@@ -55,36 +46,4 @@ def main_phase(
         first_iteration=first_iteration,
         failure_penalty=task.failure_penalty,
         models=rollouts,
-        best=best,
-    )
-
-
-def few_rollouts(settings: Rollouts) -> Rollouts:
-    """Limit settings to five episodes per iteration, see `Method.smoke`."""
-    return replace(settings, first=min(settings.first, 5), each=min(settings.each, 5))
-
-
-def short_epochs(settings: Epochs, first: int, each: int) -> Epochs:
-    """Limit settings to so many epochs, see `Method.smoke`."""
-    return replace(settings, first=min(settings.first, first), each=min(settings.each, each))
-
-
-def short_warmup(settings: WarmupSettings) -> WarmupSettings:
-    """The warm-up in seconds, see `Method.smoke`."""
-    return replace(settings, rollouts=few_rollouts(settings.rollouts), epochs=short_epochs(settings.epochs, 20, 2))
-
-
-def short_main(settings: PPOSettings, rollouts: int = 3) -> PPOSettings:
-    """The main phase in seconds, see `Method.smoke`."""
-    return replace(settings, rollouts=min(settings.rollouts, rollouts), steps=min(settings.steps, 2))
-
-
-def short_models(settings: ModelRolloutSettings) -> ModelRolloutSettings:
-    """Model rollouts in seconds, see `Method.smoke`."""
-    return replace(
-        settings,
-        iterations=min(settings.iterations, 1),
-        rollouts=min(settings.rollouts, 5),
-        steps=min(settings.steps, 2),
-        ensemble=replace(settings.ensemble, epochs=short_epochs(settings.ensemble.epochs, 2, 1)),
     )

@@ -1,13 +1,13 @@
 """The method ppo: PPO through the MPC, without a warm-up."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
 from difflcs.rl.learning.ppo import PPO, PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.methods.base import LCSMethod, Work
-from difflcs.rl.methods.phases import main_phase, short_main, short_models
+from difflcs.rl.methods.phases import main_phase
 from difflcs.rl.settings import group
 
 
@@ -28,7 +28,3 @@ class PPOMethod(LCSMethod):
     def trainer(self, work: Work) -> PPO:
         """See `Method`."""
         return main_phase(work, self.policy(work.task, self.initial(work)), self.ppo, self.models)
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        return replace(self, ppo=short_main(self.ppo), models=short_models(self.models))

@@ -1,8 +1,8 @@
 """The method ppo-mlp: the same PPO with a network as its policy."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.ppo import PPO, PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings
 from difflcs.rl.methods.base import Method, Work
-from difflcs.rl.methods.phases import main_phase, short_main
+from difflcs.rl.methods.phases import main_phase
 from difflcs.rl.settings import MOST_WIDTH, Adam, bounded, group
 from difflcs.rl.tasks import TaskSpec
 
@@ -63,7 +63,3 @@ class PPOMLPMethod(Method):
     def policy(self, task: TaskSpec, learned: MLPController) -> MLPController:
         """See `Method`."""
         return learned
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        return replace(self, ppo=short_main(self.ppo, 5))

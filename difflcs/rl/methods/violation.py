@@ -1,11 +1,11 @@
 """The method violation: the warm-up alone."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 from difflcs.rl.learning.warmup import Warmup, WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import LCSMethod, Work
-from difflcs.rl.methods.phases import short_warmup, warmup_phase
+from difflcs.rl.methods.phases import warmup_phase
 from difflcs.rl.settings import group
 
 
@@ -25,7 +25,3 @@ class ViolationMethod(LCSMethod):
         """See `Method`."""
         lcs = self.initial(work)
         return warmup_phase(work, lcs, self.policy(work.task, lcs), self.warmup)
-
-    def smoke(self) -> Self:
-        """See `Method`."""
-        return replace(self, warmup=short_warmup(self.warmup))
