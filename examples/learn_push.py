@@ -32,15 +32,15 @@ class Transitions(NamedTuple):
     x_next: Tensor
 
 
-def random_pushing(env: Any, center: NDArray[np.float64], steps: int, seed: int) -> Transitions:
-    """Collect pushes: the disc goes to random places within 90 px of the body's middle, at most 30 px ahead."""
+def random_pushing(env: Any, center: NDArray[np.float64], steps: int, seed: int, reach: float = 90.0) -> Transitions:
+    """Collect pushes: the disc goes to random places within `reach` px of the body's middle, at most 30 px ahead."""
     rng = np.random.default_rng([seed, 1])
     x, u, x_next = [], [], []
     for step in range(steps):
         if step % EPISODE == 0:
             _, info = env.reset(seed=1_000_000 + 1000 * seed + step)
         if step % HOLD == 0:
-            place = from_origin(info["block_pose"], center)[:2] * PIXELS + rng.uniform(-90, 90, 2)
+            place = from_origin(info["block_pose"], center)[:2] * PIXELS + rng.uniform(-reach, reach, 2)
         way = place - info["pos_agent"]
         target = np.clip(info["pos_agent"] + way * min(1.0, 30.0 / np.linalg.norm(way)), 0.0, 512.0)
         x.append(state(info, center))
@@ -60,7 +60,8 @@ def guess(true: PlanarPushing, seed: int) -> ContactLCS:
     """Make the start of learning: everything that is learned is wrong.
 
     The centre of mass is 20 px off in a random direction, the radius of gyration a third too large, friction 0.3 where
-    there is none, the compliance five times what we use, and every side of the outline is moved by up to 6 px.
+    there is none, the compliance five times what we use, and every side of the outline is moved by up to 6 px, but
+    where parts join: there one reaches 10 px into the other, so that they stay one body.
     """
     rng = np.random.default_rng([seed, 3])
     angle = rng.uniform(0, 2 * np.pi)
@@ -75,7 +76,21 @@ def guess(true: PlanarPushing, seed: int) -> ContactLCS:
     with torch.no_grad():
         outline = model.change["outline"]
         outline += 0.06 * torch.from_numpy(rng.uniform(-1, 1, len(outline)))
+        outline[joined(true)] = 0.1
     return ContactLCS(frozen(model.physics), learn=LEARNED)
+
+
+def joined(physics: PlanarPushing) -> Tensor:
+    """Return a mask of the sides that lie at or in another part from corner to corner: no disc ever touches them."""
+    assert isinstance(physics.shape, Union)
+    inside = []
+    for i, part in enumerate(physics.shape.parts):
+        assert isinstance(part, Polygon)
+        ends = part.vertices
+        points = torch.stack([ends, (ends + ends.roll(-1, 0)) / 2, ends.roll(-1, 0)])
+        others = [other.distance(points).distance.amin(-1) for j, other in enumerate(physics.shape.parts) if j != i]
+        inside.append((torch.stack([*others, torch.ones(points.shape[:-1]).double()]).amin(0) < 1e-6).all(0))
+    return torch.cat(inside)
 
 
 def frozen(physics: PlanarPushing) -> PlanarPushing:
@@ -111,13 +126,16 @@ def trimmed(model: ContactLCS | PlanarPushing, data: Transitions) -> Tensor:
     return each.sort().values[: int(KEPT * len(each))].mean()
 
 
-def fit(model: ContactLCS, data: Transitions, iterations: int) -> None:
-    """Fit by Adam on all data at each step; its rate falls to zero along a cosine."""
+def fit(model: ContactLCS, data: Transitions, fixed: Tensor, iterations: int) -> None:
+    """Fit by Adam on all data at each step; its rate falls to zero along a cosine. Some sides stay where they are."""
     optimizer = torch.optim.Adam(model.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
     for _ in range(iterations):
         optimizer.zero_grad()
         trimmed(model, data).backward()
+        outline = model.change["outline"].grad
+        assert outline is not None
+        outline[fixed] = 0.0
         optimizer.step()
         schedule.step()
 
@@ -130,6 +148,7 @@ def learn(
     *,
     true: PlanarPushing | None = None,
     center: NDArray[np.float64] | None = None,
+    reach: float = 90.0,
 ) -> Learned:
     """Learn a system from wrong values by random pushing.
 
@@ -140,16 +159,17 @@ def learn(
         iterations: of the fit.
         true: the system as it is, from which the wrong values begin; `tee_pushing()` by default.
         center: (2,) centre of its area, from the origin whose pose is observed; None: that of the T.
+        reach: how far from it the disc pushes, along both axes [px].
     """
     true = tee_pushing() if true is None else true
-    data = random_pushing(env, _CENTER.numpy() if center is None else center, steps, seed)
+    data = random_pushing(env, _CENTER.numpy() if center is None else center, steps, seed, reach)
     start = time.process_time()
-    model = guess(true, seed)
+    model, fixed = guess(true, seed), joined(true)
     before, first = model.summary(), frozen(model.physics)
-    fit(model, data, iterations)
+    fit(model, data, fixed, iterations)
     physics, after = frozen(model.physics), model.summary()
     smooth = ContactLCS(physics.replace(friction=0.0), learn=[name for name in LEARNED if name != "friction"])
-    fit(smooth, data, iterations // 3)
+    fit(smooth, data, fixed, iterations // 3)
     with torch.no_grad():
         loss = (float(trimmed(first, data)), float(trimmed(physics, data)))
         if float(trimmed(smooth, data)) <= 1.02 * loss[1]:
@@ -188,7 +208,7 @@ def main(seed: int = 0, shape: str | None = None) -> None:
         env = StateEnv(object_name=shape, use_obstacles=False)
         env.reset(seed=0)
         true, center = pushing(env.block)
-        result = learn(env, seed, true=true, center=center)
+        result = learn(env, seed, true=true, center=center, reach=120.0)
     print(f"{result.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
     print(f"violation loss {result.loss[0]:.2e} before, {result.loss[1]:.2e} after")
     right = {name: torch.as_tensor(getattr(true, name)).tolist() for name in ("center_of_mass", "gyration", "friction")}

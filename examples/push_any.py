@@ -166,7 +166,7 @@ class PushAnyPolicy(DiscPolicy):
         system, center = pushing(env.block)
         if learned:
             alone = StateEnv(object_name=env.object_name, use_obstacles=False)
-            system = learn(alone, 0, true=system, center=center).physics
+            system = learn(alone, 0, true=system, center=center, reach=120.0).physics
         assert isinstance(system.shape, Union)
         self._corners = torch.cat([part.vertices for part in system.shape.parts if isinstance(part, Polygon)])
         self._paths = BodyPaths(self._gap, SIDE, self.ROOM)
