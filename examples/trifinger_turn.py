@@ -7,7 +7,7 @@ likewise. A decision moves the targets of nine joints by at most 0.01 rad from w
 
 The controller knows model and state. It is that of the Allegro hand (`benchmarks/scoreboard/inhand.py`) in small: a
 quasi-dynamic `MujocoLCS` and a `MujocoCost`, linearised where robot and object are; a planned step is tried in MuJoCo,
-and the fingers let go and take the object anew where it comes no nearer.
+and where the object comes no nearer the fingers let go, go round it or over it, and take it anew.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ HEIGHTS = {  # of the objects' centres at the start and at the goal, as publishe
 }
 JOINTS = np.tile([0.0, -0.7, -1.1], 3)
 FINGERS = "fingertip_0", "fingertip_120", "fingertip_240"
+ELBOWS = "finger_lower_link_0", "finger_lower_link_120", "finger_lower_link_240"
 STIFFNESS, DAMPING = 10.0, 0.05  # of the torques, as published [Nm/rad, Nms/rad]
 LIMIT, HELD, SUBSTEPS, DECISIONS, SECONDS = 0.01, 21, 20, 500, 0.04
 
@@ -82,16 +83,20 @@ class Settings:
     """Cost by which a step has to end better than now for no slower one to be tried."""
     slack: float = 0.005
     """Cost by which a faster step may end worse than the best."""
+    upright: float = 50.0
+    """Cost of a tilt, as the square of its sine, in the trials: nothing sets an object upright again."""
     ring: float = 0.05
-    """Distance from the object's middle of the points to which fingertips are drawn, one of them behind it [m]."""
+    """Distance from the object's middle of the points to which fingertips are drawn while they push [m]."""
     patience: int = 25
-    """Decisions without progress after which the fingers go over the object and round it, and take it anew."""
-    opening: int = 60
-    """Decisions of that, a third each to lift them, to bring them round it, and to lower them."""
-    high: float = 0.1
-    """Height to which they are lifted [m]."""
-    apart: float = 0.015
-    """Distance from the object at which they come down [m]."""
+    """Decisions without progress after which the fingers let go and take the object anew."""
+    opening: int = 150
+    """Decisions after which they push again, even if they are not there."""
+    clear: float = 0.02
+    """Height above the object at which a fingertip passes over it [m]."""
+    apart: float = 0.02
+    """Distance from the object's box of the points to which they go [m]."""
+    margin: float = 0.012
+    """Distance from the box within which it is in a fingertip's way [m]."""
 
 
 @dataclass
@@ -190,7 +195,7 @@ class Policy:
         self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
         self.random, self.best, self.waited, self.times = np.random.RandomState(0), np.inf, 0, []
         self.geom = model.geom("obj").id
-        self.turned = 0.0
+        self.turned, self.spots = 0.0, np.zeros((3, 3))
 
     def angle(self, data: Any) -> float:
         """Angle by which the object is still to be turned [rad]."""
@@ -206,18 +211,48 @@ class Policy:
             self.best, self.waited = np.inf, -s.opening
         return self.waited < 0
 
-    def around(self, data: Any, radius: float) -> np.ndarray:
-        """Points (3, 3) round the object for the fingertips, one of them behind it as seen from its place."""
-        here = data.qpos[:3]
-        away, tips = here - self.place, find_tips(data)
-        if np.linalg.norm(away[:2]) < 0.01:
+    def around(self, data: Any, apart: float | None = None) -> np.ndarray:
+        """Points (3, 3) round the object for the fingertips: one of them is behind it as seen from its place, or two.
+
+        Of the ways to share them out, that which is nearest to where the fingers' elbows are: a finger cannot reach
+        over the object. The points lie on the ring, or so far from the box of the object.
+        """
+        s, here = self.settings, data.qpos[:3]
+        away, elbows = here - self.place, np.array([data.body(elbow).xpos for elbow in ELBOWS])
+        if apart is None and np.linalg.norm(away[:2]) < 0.01:
             return np.tile(here, (3, 1))
-        angles = np.arctan2(away[1], away[0]) + np.array([0.0, 2.0, -2.0]) * np.pi / 3
-        own = np.arctan2(*(tips - here).T[[1, 0]])
-        gap = np.abs((own[:, None] - angles + np.pi) % (2 * np.pi) - np.pi)
-        order = min(permutations(range(3)), key=lambda order: sum(gap[range(3), order] ** 2))
-        chosen = angles[list(order)] + self.turned
-        return here + radius * np.stack([np.cos(chosen), np.sin(chosen), np.zeros(3)], -1)
+        behind, outside = (np.arctan2(*vector[..., 1::-1].T) for vector in (away, elbows - here))
+        thirds = np.array([0.0, 2.0, -2.0]) * np.pi / 3
+        ways = [behind + half + thirds[[*order]] for half in (0.0, np.pi) for order in permutations(range(3))]
+        turns = (np.array(ways) - outside + np.pi) % (2 * np.pi) - np.pi
+        angles = ways[np.sum(turns**2, 1).argmin()] + self.turned
+        directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], -1)
+        if apart is None:
+            return here + s.ring * directions
+        middle, axes, half = self.box(data)
+        return middle + (apart + np.abs(directions @ axes) @ half)[:, None] * directions
+
+    def box(self, data: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Middle (3,), axes (3, 3) and half sizes (3,) of the box of the object."""
+        box, axes = self.twin.geom_aabb[self.geom], data.geom_xmat[self.geom].reshape(3, 3)
+        return data.geom_xpos[self.geom] + axes @ box[:3], axes, box[3:]
+
+    def approach(self, data: Any) -> np.ndarray | None:
+        """Next points (3, 3) of the fingertips on their ways to `spots`, over the object where it is in the way.
+
+        None: they are there.
+        """
+        s, tips, points = self.settings, find_tips(data), self.spots.copy()
+        middle, axes, half = self.box(data)
+        top = middle[2] + np.abs(axes[2]) @ half + s.clear
+        for tip, point in zip(tips, points, strict=True):
+            path = np.linspace(tip[:2], point[:2], 12)
+            inside = np.abs(np.column_stack([path - middle[:2], np.zeros(12)]) @ axes) < half + s.margin
+            if np.linalg.norm(path[-1] - path[0]) > 0.01 and inside.all(1).any():
+                if tip[2] < top - 0.005:
+                    point[:2] = tip[:2]
+                point[2] = top
+        return points if np.abs(self.spots - tips).max() > 0.015 else None
 
     def reach(self, data: Any, points: np.ndarray) -> np.ndarray:
         """Targets of the joints that bring the fingertips nearer to points (3, 3)."""
@@ -236,13 +271,14 @@ class Policy:
             self.mpc.reset()
             if self.waited == -s.opening:
                 self.turned = 0.5 * self.random.randn()
-            points = find_tips(data)
-            if self.waited >= -2 * s.opening // 3:
-                points = self.around(data, s.apart + float(self.twin.geom_aabb[self.geom, 3:].max()))
-            points[:, 2] = s.high if self.waited < -s.opening // 3 else self.place[2]
-            return self.reach(data, points)
+                self.spots = self.around(data, s.apart)
+                self.spots[:, 2] = self.place[2]
+            points = self.approach(data)
+            if points is not None:
+                return self.reach(data, points)
+            self.waited = 0
         begun = time.thread_time()
-        points = self.around(data, s.ring)
+        points = self.around(data)
         action = self.mpc.step(self.module.observe(data), np.concatenate([self.place, self.goal, *points]))
         move = self.rehearse(data, np.clip(action / s.pace, -LIMIT, LIMIT))
         self.times.append(1e3 * (time.thread_time() - begun))
@@ -264,11 +300,15 @@ class Policy:
         return next(pace for pace, end in zip(s.paces, ends, strict=False) if end <= min(ends) + s.slack) * move
 
     def miss(self, data: Any) -> float:
-        """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""
+        """Cost of the object's place and tilt, 0.1 s later if nothing stops it, and of its orientation."""
         s, left = self.settings, self.angle(data)
         square = float(np.sum((data.qpos[:3] + 0.1 * data.qvel[:3] - self.place) ** 2))
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, data.qpos[3:7])
+        axes = axes.reshape(3, 3)
+        up = axes[:, 2] + 0.1 * np.cross(axes @ data.qvel[3:6], axes[:, 2])
         near = min(left, s.reach)
-        return s.place * square + s.turn * near * (2 * left - near)
+        return s.place * square + s.turn * near * (2 * left - near) + s.upright * float(up[:2] @ up[:2])
 
 
 def play(o: Options, name: str, seed: int) -> dict[str, Any]:
