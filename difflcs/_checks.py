@@ -105,7 +105,9 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         NonFiniteError: NaN or infinity inside.
     """
     if not isinstance(value, Tensor):
-        raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
+        raise DTypeError(
+            f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...).double()"
+        )
     if value.dtype not in FLOATS:
         raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
     if value.layout is not torch.strided or value.is_nested or value.is_neg():  # see `is_array`
@@ -127,7 +129,9 @@ def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> Non
     """Check the trailing dimensions of a tensor, as a part of `check_tensor`."""
     if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it, or rebuild it")
+        turned = len(dims) == 2 and value.ndim > 1 and value.shape[-2] != dims[0][1] == value.shape[-1]
+        how = "transpose it" if turned else "reshape it, or rebuild it"
+        raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; {how}")
 
 
 def check_shape(
@@ -312,7 +316,13 @@ def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = 
     """Check a finite real number (see `plain`), at least (`strict`: above) `minimum`."""
     value = plain(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DTypeError(f"{name}: expected a number, got {describe(value)}; convert it with float(...)")
+        learned = isinstance(value, Tensor) and value.requires_grad
+        how = (
+            "pass matrices that are made of it, as a number has no gradient"
+            if learned
+            else "convert it with float(...)"
+        )
+        raise DTypeError(f"{name}: expected a number, got {describe(value)}; {how}")
     too_small = value <= minimum if strict else value < minimum
     try:
         number = float(value)

@@ -3,6 +3,8 @@
 Every message says what was expected, what came, and how to mend it.
 """
 
+import sys
+import warnings
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -119,3 +121,11 @@ class FrictionWarning(DiffLCSWarning):
 
 class ContactWarning(DiffLCSWarning):
     """More contacts are near than there is room for."""
+
+
+def warn(message: str, category: type[DiffLCSWarning]) -> None:
+    """Warn at the line that called this library, outside of it and of torch."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in ("difflcs", "torch"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

@@ -1,7 +1,6 @@
 """Batched, differentiable linear complementarity problems."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, takes_arrays
 from difflcs._differentiation import Gradients, Solver, Tensors, is_wrapped, runs_eagerly, solve
-from difflcs.errors import ShapeError, SolveWarning
+from difflcs.errors import ShapeError, SolveWarning, warn
 from difflcs.status import Status
 
 # Block principal pivoting needs 3–10 iterations; the limit only bounds pathological inputs. The relaxed solve follows
@@ -86,7 +85,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float |
     single = torch.float32 in (F.dtype, q.dtype)
     lam, w, status = solve(_Problems(relaxation, limit, single), F_flat, q_flat)
     if not is_wrapped(status):
-        _warn_of_failures(status, stacklevel=4)
+        _warn_of_failures(status)
     return LCPSolution(
         lam.reshape(*batch, n).to(q.dtype), w.reshape(*batch, n).to(q.dtype), status.reshape(batch).to(q.device)
     )
@@ -112,14 +111,13 @@ def solve_lcp_arrays(
     return lam, w, status
 
 
-def _warn_of_failures(status: Tensor, stacklevel: int) -> None:
+def _warn_of_failures(status: Tensor) -> None:
     failed = int((status != Status.CONVERGED).sum())
     if failed:
-        warnings.warn(
+        warn(
             f"{failed} of {status.numel()} LCPs were not solved; their gradient is zero. Expected P-matrices: check "
             f"that F + Fᵀ is positive definite, and read .status (MAX_ITER: not within time_limit)",
             SolveWarning,
-            stacklevel=stacklevel,
         )
 
 
@@ -152,7 +150,7 @@ class _Problems(Solver):
             status = torch.where(too_large, int(Status.NUMERICAL), status).to(torch.int8)
             lam, w = (torch.where(too_large.unsqueeze(-1), v.clamp_max(_FLOAT32), v) for v in (lam, w))
         if transformed:
-            _warn_of_failures(status, stacklevel=2)
+            _warn_of_failures(status)
         return lam.to(q.device), w.to(q.device), status.to(q.device)
 
     def pullback(self, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from difflcs._checks import all_finite, check_tensor
 from difflcs._differentiation import Gradients, Solver, Tensors, refuse_tangents, solve, transforms_active
-from difflcs.errors import DegenerateWarning
+from difflcs.errors import DegenerateWarning, warn
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.setup import GUESS, RANKS, SYMMETRIC, Call, Inputs, Setup, check_guess, gather
@@ -283,11 +282,10 @@ def _finite(vjp: Callable[[Tensor], dict[str, Tensor]], solved: Tensor, limit: f
             todo += [index[: len(index) // 2], index[len(index) // 2 :]]
         else:
             dropped += 1
-    warnings.warn(
+    warn(
         f"the gradient of {dropped} of {len(solved)} solutions is not finite and was left out; check the scale of the "
         f"inputs and of the gradient that arrives at the layer",
         DegenerateWarning,
-        stacklevel=2,
     )
     return total
 

@@ -1,8 +1,6 @@
 """PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
-import sys
 import time
-import warnings
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +9,7 @@ from difflcs._checks import check_choice, check_number, check_positive_int, take
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound
-from difflcs.errors import DegenerateWarning, InvalidInputError, SolveError, SolveWarning
+from difflcs.errors import DegenerateWarning, InvalidInputError, SolveError, SolveWarning, warn
 from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.repeat import Repeat
@@ -245,11 +243,10 @@ class LCSMPCLayer(nn.Module):
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         if needs_grad and (degenerate := int((status == Status.DEGENERATE).sum())):
-            warnings.warn(
+            warn(
                 f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "
                 f"a singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
                 DegenerateWarning,
-                stacklevel=_stacklevel(),
             )
         if self._warned and self.on_failure == "mask":
             return
@@ -264,17 +261,8 @@ class LCSMPCLayer(nn.Module):
             raise SolveError(f'{message}. Pass on_failure="mask" to go on without them', failed, codes)
         if not self._warned:
             self._warned = True
-            warnings.warn(
+            warn(
                 f"{message}. Their actions are the last iterate inside the bounds and their gradient is zero "
                 f"(this layer warns once)",
                 SolveWarning,
-                stacklevel=_stacklevel(),
             )
-
-
-def _stacklevel() -> int:
-    """Find the stack level of the line that called the layer, outside this package and torch, for a warning."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in ("difflcs", "torch"):
-        level, frame = level + 1, frame.f_back
-    return level

@@ -21,7 +21,6 @@ within the step, so that friction is right at every step of a plan. Two models o
   `FrictionWarning` says so; use Anitescu's model there.
 """
 
-import warnings
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -40,7 +39,7 @@ from difflcs._checks import (
 )
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
-from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError, warn
 from difflcs.records import LCSParams
 
 Cone = Literal["anitescu", "stewart-trinkle"]
@@ -393,11 +392,10 @@ def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
     mobility = W.detach()[..., normals + 1, normals + 1].amax(-1)
     part = float((drag.detach() * mobility).median())
     if part > _LARGE_DRAG:
-        warnings.warn(
-            f"friction by Stewart and Trinkle needs a drag here that gives {part:.2g} times the distance of a slide "
-            f'back, as several contacts share a load: use cone="anitescu", or a larger compliance',
+        warn(
+            "friction by Stewart and Trinkle needs a drag here that gives more than a quarter of a slide back, as "
+            'several contacts share a load: take fewer contacts, cone="anitescu", or a larger compliance',
             FrictionWarning,
-            stacklevel=4,
         )
 
 

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs import Scales, violation_loss
+from difflcs import Scales, rl, violation_loss
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 from difflcs.rl import ContactMethod, MujocoMethod, PhysicsFit, PhysicsFitSettings, PhysicsSpec, evaluate, get_task
 from difflcs.rl.learning.physics_fit import physics_loss
 from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
-from difflcs.rl.methods.contact_lcs import known_physics
 from tests.conformance.toy import Guess, Slide, make_task
 from tests.conftest import refuse
 
@@ -83,9 +82,10 @@ def test_the_policy_plans_with_what_the_description_says():
         assert (policy.horizon, policy.relaxation) == wanted
 
 
-def test_a_task_without_physics_is_refused():
-    task = make_task(physics=None)
-    refuse(InvalidInputError, "known physics for contact-lcs, got toy without", known_physics, task)
+def test_a_task_without_physics_is_refused_and_its_place_stays_free(tmp_path):
+    task, config = make_task(physics=None), rl.TrainConfig(task="toy", method=ContactMethod())
+    refuse(InvalidInputError, "known physics for contact-lcs, got toy without", rl.train, config, tmp_path, task=task)
+    rl.RunDirectory.check_free(tmp_path)
 
 
 def test_what_was_learned_of_another_object_is_refused():

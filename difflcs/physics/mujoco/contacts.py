@@ -7,7 +7,6 @@ and how many contacts there are.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs._checks import check_list, describe
-from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.errors import ContactWarning, InvalidInputError, warn
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, MESH, NATIVE, PLANE, Array, describe_solid, have_faces
@@ -232,12 +231,11 @@ class ContactFinder:
     def _warn_of_more(self, near: int) -> None:
         """Warn once if near contacts are dropped because their number was left to the default."""
         if near > self.n_contacts:
-            warnings.warn(
+            warn(
                 f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; only the nearest "
                 f"are kept, so that something may sink or fall: pass contacts={near}, or contacts={self.n_contacts} "
                 f"if these are enough",
                 ContactWarning,
-                stacklevel=5,
             )
             self._warn_within = -np.inf
 
@@ -311,7 +309,7 @@ def _warn_of_left_out(model: Any, allowed: NDArray[np.bool_], rolling: Array) ->
         left[text] = np.append(of_geoms[allowed.any(0)] if len(of_geoms) else of_geoms, of_pairs)
     for text, values in left.items():
         if values.any():
-            warnings.warn(f"expected {text}", ContactWarning, stacklevel=4)
+            warn(f"expected {text}", ContactWarning)
 
 
 def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | None) -> None:

@@ -10,7 +10,6 @@ where they do worse than nothing, and goes to d: a grip many times as firm as at
 many times as large.
 """
 
-import warnings
 from typing import Any
 
 import mujoco
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_shape, check_tensor
-from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.errors import ContactWarning, InvalidInputError, warn
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
@@ -174,11 +173,10 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
         worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)
         dof = int(np.argmax(np.abs(off[worst] * (mass[worst[1]] @ off[worst]))))
         joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
-        warnings.warn(
+        warn(
             f"expected a system as near to MuJoCo's own step as standing still is, also at the ends of the ranges of "
             f"its actions and between, got one that is farther off with such an action in {wrong.sum()} of "
             f"{len(wrong)} states, most of all joint {joint.name or joint.id!r} of body {body.name or body.id!r}: take "
             f"fewer seconds, or a nominal control (ctrl) near the actions",
             ContactWarning,
-            stacklevel=4,
         )

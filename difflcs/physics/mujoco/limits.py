@@ -12,7 +12,6 @@ far friction creeps, when in the step the force acts, and whether it does so all
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import mujoco
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs._checks import check_positive_int
-from difflcs.errors import ContactWarning
+from difflcs.errors import ContactWarning, warn
 from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.native import flags, native
 
@@ -232,12 +231,11 @@ class RowFinder:
         """Warn once if limits that act at the nominal action are dropped because of the default number."""
         acting = int((after < 0).sum(-1).max(initial=0))
         if self._warn and acting > self.n_limits:
-            warnings.warn(
+            warn(
                 f"expected at most {self.n_limits} limits of joints and tendons that act in a step, got {acting}; only "
                 f"the nearest are kept, so that others are passed: pass limits={acting}, or limits={self.n_limits} if "
                 f"these are enough",
                 ContactWarning,
-                stacklevel=5,
             )
             self._warn = False
 

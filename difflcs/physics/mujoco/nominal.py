@@ -12,7 +12,6 @@ contacts do under their load.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import mujoco
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from difflcs.errors import ContactWarning
+from difflcs.errors import ContactWarning, warn
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
@@ -201,12 +200,11 @@ def solve_soft(
     threads = max(1, min(len(gap), torch.get_num_threads()))
     missed = _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
     if missed:
-        warnings.warn(
+        warn(
             f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} of "
             f"{len(gap)} states, so that what touches there may creep: look for bodies of very different mass, or pass "
             f"a larger compliance",
             ContactWarning,
-            stacklevel=2,
         )
     return force
 

@@ -253,12 +253,12 @@ class _Training:
                 f"init: expected none with method {method.name}, which learns networks instead of an LCSModel"
             )
         reopened = None
-        if not resume:  # a run that was stored before this check existed can be continued
-            _check_times(self.config)
-        if resume:
+        if resume:  # also a run that was stored before the other check existed
             reopened, init = self._reopen(held)
             if reopened.finished():
                 return reopened
+        else:
+            _check_times(self.config)
         model = None if init is None else load_model(init)
         if model is not None:
             check_fits(model, self.task, init)
@@ -271,13 +271,17 @@ class _Training:
             _record_object(run, self.task.describe(self.opened[-1]))
             return self.opened[-1]
 
+        refused = reopened is None
         try:
             trainer = method.trainer(Work(self.task, self.config.seed, self.total_episodes, open_envs, model))
             if state is not None:
                 trainer.load(state)
             begun()
+            refused = False
             self._loop(run, trainer, open_envs, fresh=state is None)
         finally:
+            if refused:
+                (run.path / "config.json").unlink()
             for envs in self.opened:
                 envs.close()
         return run
