@@ -17,6 +17,8 @@ _MEMORY = 0.7
 """Weight of the metric so far against that of a new measurement."""
 DAMPING = 0.1
 """Isotropic part of the metric of a policy, in means of its diagonal."""
+MOMENTUM = 0.8
+"""Weight of the gradient of a policy so far against the newest one; kept across iterations."""
 _LONGEST = 3.0
 """Longest Jacobian of one sample, in medians of those of its batch: samples near a jump of the MPC have huge ones."""
 
@@ -27,8 +29,6 @@ class Natural(Settings):
 
     step: float = bounded(0.06, above=0)
     """Length of a step at the start: the root of twice the KL divergence that it makes."""
-    momentum: float = bounded(0.8, minimum=0, below=1)
-    """Weight of the gradient so far against the newest one; kept across iterations. 0 turns it off."""
 
 
 class NaturalGradient(torch.optim.Optimizer):

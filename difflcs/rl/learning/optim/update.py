@@ -16,7 +16,7 @@ from torch import nn
 
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.checks import check_depends, check_learned
-from difflcs.rl.learning.optim.natural import DAMPING, Natural, NaturalGradient
+from difflcs.rl.learning.optim.natural import DAMPING, MOMENTUM, Natural, NaturalGradient
 from difflcs.rl.learning.state_tree import State, initialise_moments, load_moments, moments
 from difflcs.rl.settings import Adam
 
@@ -201,7 +201,7 @@ class NaturalUpdate(UpdateRule):
         samples: int = METRIC_SAMPLES,
     ):
         learned = learned_parameters(actor)
-        natural = NaturalGradient(learned, settings.step, settings.momentum, DAMPING)
+        natural = NaturalGradient(learned, settings.step, MOMENTUM, DAMPING)
         super().__init__(
             learned, natural, StepSize(settings.step, target_kl, factor, math.sqrt(2 * target_kl)), deviation
         )
