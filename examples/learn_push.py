@@ -22,6 +22,7 @@ LEARNED = ("center_of_mass", "gyration", "friction", "compliance", "outline")
 RATE, XI, KEPT = 0.03, 0.1, 0.8
 EPISODE = 100
 HOLD = 6
+ROUND = 6
 
 
 class Transitions(NamedTuple):
@@ -61,7 +62,7 @@ def guess(true: PlanarPushing, seed: int) -> ContactLCS:
 
     The centre of mass is 20 px off in a random direction, the radius of gyration a third too large, friction 0.3 where
     there is none, the compliance five times what we use, and every side of the outline is moved by up to 6 px, but
-    where parts join: there one reaches 10 px into the other, so that they stay one body.
+    where parts join: there one reaches 10 px into the other, so that they stay one body. A round part has one size.
     """
     rng = np.random.default_rng([seed, 3])
     angle = rng.uniform(0, 2 * np.pi)
@@ -75,7 +76,7 @@ def guess(true: PlanarPushing, seed: int) -> ContactLCS:
     model = ContactLCS(physics, learn=("outline",))
     with torch.no_grad():
         outline = model.change["outline"]
-        outline += 0.06 * torch.from_numpy(rng.uniform(-1, 1, len(outline)))
+        outline += 0.06 * torch.from_numpy(rng.uniform(-1, 1, len(outline)))[together(true)]
         outline[joined(true)] = 0.1
     return ContactLCS(frozen(model.physics), learn=LEARNED)
 
@@ -91,6 +92,14 @@ def joined(physics: PlanarPushing) -> Tensor:
         others = [other.distance(points).distance.amin(-1) for j, other in enumerate(physics.shape.parts) if j != i]
         inside.append((torch.stack([*others, torch.ones(points.shape[:-1]).double()]).amin(0) < 1e-6).all(0))
     return torch.cat(inside)
+
+
+def together(physics: PlanarPushing) -> Tensor:
+    """Return the index of the side that each side moves with: itself, in a round part of many sides the first."""
+    assert isinstance(physics.shape, Union)
+    counts = [len(part.vertices) for part in physics.shape.parts if isinstance(part, Polygon)]
+    first = np.cumsum([0, *counts])
+    return torch.cat([torch.arange(n) * (n <= ROUND) + int(k) for n, k in zip(counts, first, strict=False)])
 
 
 def frozen(physics: PlanarPushing) -> PlanarPushing:
@@ -128,6 +137,7 @@ def trimmed(model: ContactLCS | PlanarPushing, data: Transitions) -> Tensor:
 
 def fit(model: ContactLCS, data: Transitions, fixed: Tensor, iterations: int) -> None:
     """Fit by Adam on all data at each step; its rate falls to zero along a cosine. Some sides stay where they are."""
+    groups = together(model.guess)
     optimizer = torch.optim.Adam(model.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
     for _ in range(iterations):
@@ -135,6 +145,7 @@ def fit(model: ContactLCS, data: Transitions, fixed: Tensor, iterations: int) ->
         trimmed(model, data).backward()
         outline = model.change["outline"].grad
         assert outline is not None
+        outline.copy_(torch.zeros_like(outline).index_add(0, groups, outline)[groups])
         outline[fixed] = 0.0
         optimizer.step()
         schedule.step()
