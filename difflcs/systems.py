@@ -66,16 +66,11 @@ def cart_pole_between_walls(
     Raises:
         InvalidInputError: an argument is out of its range.
     """
-    M, m, L, k, h = (
-        _number(name, value, strict=True)
-        for name, value in {
-            "cart_mass": cart_mass,
-            "pole_mass": pole_mass,
-            "pole_length": pole_length,
-            "wall_stiffness": wall_stiffness,
-            "dt": dt,
-        }.items()
-    )
+    M = _number("cart_mass", cart_mass, strict=True)
+    m = _number("pole_mass", pole_mass, strict=True)
+    L = _number("pole_length", pole_length, strict=True)
+    k = _number("wall_stiffness", wall_stiffness, strict=True)
+    h = _number("dt", dt, strict=True)
     w, g = _number("wall_distance", wall_distance), _number("gravity", gravity)
     gravity_effect = _matrix([[0, -m * g / M], [0, g * (M + m) / (M * L)]])  # on (p̈, θ̈), from (p, θ)
     force_effect = _matrix([[1 / M], [-1 / (M * L)]])
@@ -147,10 +142,9 @@ def block_along_wall(
     Raises:
         InvalidInputError: an argument is out of its range.
     """
-    beta, k, h = (
-        _number(name, value, strict=True)
-        for name, value in {"damping": damping, "stiffness": stiffness, "dt": dt}.items()
-    )
+    beta = _number("damping", damping, strict=True)
+    k = _number("stiffness", stiffness, strict=True)
+    h = _number("dt", dt, strict=True)
     mu, alpha = _number("friction", friction), _number("face_angle", face_angle)
     check_number("pi/2 - face_angle", torch.pi / 2 - float(alpha.detach()), strict=True)
     stick = check_number("stick", stick, strict=True)

@@ -50,9 +50,9 @@ class Shape(ABC):
     """A closed outline in coordinates of its body."""
 
     @property
-    @abstractmethod
     def n_parts(self) -> int:
         """Parts, each of which is a contact."""
+        return 1
 
     @abstractmethod
     def distance(self, points: Tensor) -> Distance:
@@ -129,11 +129,6 @@ class Polygon(Shape):
         return self.vertices.flip(0) if vars(self).get("turned") else self.vertices
 
     @property
-    def n_parts(self) -> int:
-        """See `Shape`."""
-        return 1
-
-    @property
     def radius(self) -> float:
         """See `Shape`."""
         return float(self.vertices.detach().norm(dim=1).max())
@@ -205,11 +200,6 @@ class Circle(Shape):
             raise InvalidInputError(f"r: expected one number above 0, got {describe(self.r)}; give the radius")
         object.__setattr__(self, "r", r)
         object.__setattr__(self, "center", center)
-
-    @property
-    def n_parts(self) -> int:
-        """See `Shape`."""
-        return 1
 
     @property
     def radius(self) -> float:

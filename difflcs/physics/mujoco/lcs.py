@@ -12,14 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import (
-    check_array,
-    check_choice,
-    check_kind,
-    check_number,
-    check_positive_int,
-    check_tensor,
-)
+from difflcs._checks import check_array, check_choice, check_kind, check_number, check_positive_int, check_tensor
 from difflcs.errors import InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
     Bounded,

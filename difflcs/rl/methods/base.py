@@ -114,8 +114,8 @@ class Method(Settings, ABC):
 
     @property
     def solver(self) -> str | None:
-        """Name of the MPC's backend; None where there is no MPC."""
-        return None
+        """Name of the MPC's backend, which is the setting `backend`; None where there is no MPC."""
+        return getattr(self, "backend", None)
 
     def check(self, minutes: float) -> None:
         """Raise if the method cannot be trained, before anything is written.
@@ -123,6 +123,8 @@ class Method(Settings, ABC):
         Raises:
             InvalidInputError: the minutes of data do not fit the settings, or a solver is missing.
         """
+        if self.solver is not None:
+            get_backend(self.solver)
 
     def smoke(self) -> Self:
         """Return a copy that runs in seconds: too little of everything, see `_FEW`, to learn anything."""
@@ -146,15 +148,6 @@ class LCSMethod(Method):
     takes_init: ClassVar[bool] = True
     model: ClassVar[type[LCSModel]] = LCSModel
     learn_c: ClassVar[bool] = False
-
-    @property
-    def solver(self) -> str:
-        """See `Method`."""
-        return self.backend
-
-    def check(self, minutes: float) -> None:
-        """See `Method`."""
-        get_backend(self.backend)
 
     def rebuild(
         self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str

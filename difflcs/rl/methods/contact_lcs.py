@@ -11,7 +11,6 @@ from torch import Tensor
 from difflcs import _storage
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.mpc import LCSMPCLayer
-from difflcs.mpc.backends import get_backend
 from difflcs.records import LCSModule
 from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
@@ -45,15 +44,6 @@ class ContactMethod(Method):
     summary: ClassVar[str] = "known contacts whose physics is fitted, then PPO through the MPC; told the outline"
     reports: ClassVar[tuple[type, ...]] = (PhysicsFitReport, PPOReport)
     kind: ClassVar[str] = "physics"
-
-    @property
-    def solver(self) -> str:
-        """See `Method`."""
-        return self.backend
-
-    def check(self, minutes: float) -> None:
-        """See `Method`."""
-        get_backend(self.backend)
 
     def trainer(self, work: Work) -> Trainer:
         """See `Method`.
