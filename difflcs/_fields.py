@@ -20,7 +20,7 @@ class TensorFields(nn.Module):
 
     by_stage: frozenset[str] = frozenset()
 
-    def _register(self, name: str, value: Tensor, persistent: bool = True) -> None:
+    def _register(self, name: str, value: Tensor | None, persistent: bool = True) -> None:
         if isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
         else:

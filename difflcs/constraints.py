@@ -124,10 +124,7 @@ class _Constraints(TensorFields):
             )
         check_constraints(fields["g"], fields.get("weight"))
         for name in _DIMENSIONS:
-            if name in fields:
-                self._register(name, fields[name])
-            else:
-                self.register_buffer(name, None)
+            self._register(name, fields.get(name))
 
     def tensors(self) -> dict[str, Tensor]:
         """Return name in a problem → tensor: G_x, g, price, and G_u if the actions count."""

@@ -44,19 +44,7 @@ class _Quadratic(TensorFields):
     S: Tensor | None
     constant_stage: Tensor | None
 
-    def _fill(
-        self,
-        Q: Tensor,
-        R: Tensor,
-        Q_final: Tensor,
-        q: Tensor | None,
-        r: Tensor | None,
-        q_final: Tensor | None,
-        constant: Tensor | None,
-        S: Tensor | None,
-        check: bool,
-        constant_stage: Tensor | None = None,
-    ) -> None:
+    def _fill(self, Q: Tensor, R: Tensor, Q_final: Tensor, check: bool, **others: Tensor | None) -> None:
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
             if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
@@ -66,30 +54,28 @@ class _Quadratic(TensorFields):
             "Q": Q,
             "R": R,
             "Q_final": Q_final,
-            "q": Q.new_zeros(self.n_x) if q is None else q,
-            "r": R.new_zeros(self.n_u) if r is None else r,
-            "q_final": Q.new_zeros(self.n_x) if q_final is None else q_final,
-            "constant": Q.new_zeros(()) if constant is None else constant,
+            "q": Q.new_zeros(self.n_x),
+            "r": R.new_zeros(self.n_u),
+            "q_final": Q.new_zeros(self.n_x),
+            "constant": Q.new_zeros(()),
+            **{name: value for name, value in others.items() if value is not None},
         }
         x, u = ("n_x", self.n_x), ("n_u", self.n_u)
-        dims = {"Q_final": [x, x], "q": [x], "r": [u], "q_final": [x], "constant": []}
-        for name, value, dim in (("S", S, [x, u]), ("constant_stage", constant_stage, [])):
-            if value is None:
-                self.register_buffer(name, None)
-            else:
-                fields[name], dims[name] = value, dim
+        dims = {"Q_final": [x, x], "q": [x], "r": [u], "q_final": [x], "constant": [], "S": [x, u]}
+        dims["constant_stage"] = []
         for name, dim in dims.items():
-            check_tensor(name, fields[name], dim)
+            if name in fields:
+                check_tensor(name, fields[name], dim)
         check_same_device(fields.items())
         if self.by_stage:
             check_stages({k: (fields[k], _DIMENSIONS[k], 0) for k in _STAGES if k in self.by_stage})
         if check:
-            for name in ("Q", "R", "Q_final") if S is None else ("Q_final",):
+            for name in ("Q_final",) if "S" in fields else ("Q", "R", "Q_final"):
                 _check_convex(name, fields[name])
-            if S is not None:
+            if "S" in fields:
                 _check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
-        for name, value in fields.items():
-            self._register(name, value)
+        for name in _DIMENSIONS:
+            self._register(name, fields.get(name))
 
     def _stage_hessian(self, fields: dict[str, Tensor]) -> Tensor:
         blocks = []
@@ -155,7 +141,9 @@ class QuadraticCost(_Quadratic):
         check: bool = True,
     ):
         super().__init__()
-        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check, constant_stage)
+        self._fill(
+            Q, R, Q_final, check, q=q, r=r, q_final=q_final, constant=constant, S=S, constant_stage=constant_stage
+        )
 
     @classmethod
     def of_checked(cls, fields: Mapping[str, Tensor]) -> Self:
@@ -208,7 +196,7 @@ class CostSequence(_Quadratic):
         super().__init__()
         names = [name for name, value in (("Q", Q), ("R", R), ("q", q), ("r", r), ("S", S)) if value is not None]
         self.by_stage = check_by_stage(by_stage, _STAGES, names)
-        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check)
+        self._fill(Q, R, Q_final, check, q=q, r=r, q_final=q_final, constant=constant, S=S)
 
     @property
     def horizon(self) -> int:

@@ -244,17 +244,16 @@ def _latex(table: pd.DataFrame) -> str:
     return text
 
 
-def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
+def update_readme(name: str, markdown: str) -> None:
     """Replace the text between `<!-- results: NAME -->` and `<!-- end -->`; do nothing without such a mark."""
-    readme = readme or README
-    text = readme.read_text()
+    text = README.read_text()
     before, mark, rest = text.partition(f"<!-- results: {name} -->\n")
     _, end, after = rest.partition("<!-- end -->")
     if mark and not end:
-        raise CheckpointError(f"{readme}: expected <!-- end --> after {mark.strip()}, found none; put it back")
+        raise CheckpointError(f"{README}: expected <!-- end --> after {mark.strip()}, found none; put it back")
     new = f"{before}{mark}\n{markdown}\n{end}{after}"
     if mark and new != text:
-        write_atomically(readme, new.encode())
+        write_atomically(README, new.encode())
 
 
 def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str, str, str]]) -> None:

@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata
+from importlib import import_module, metadata
 from itertools import groupby
 from textwrap import TextWrapper
 from typing import Any
@@ -164,17 +164,8 @@ def _check(group: str, name: str, work: Callable[[], str], core: bool = False) -
 # --- library and solvers ----------------------------------------------------------------------------------------------
 
 
-def _python() -> str:
-    return f"{platform.python_version()}, {platform.system()} {platform.machine()}"
-
-
 def _hard_dependencies() -> str:
-    import casadi
-    import numpy
-    import safetensors
-
-    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "safetensors": safetensors}
-    return ", ".join(f"{name} {modules[name].__version__}" for name in _HARD)
+    return ", ".join(f"{name} {import_module(name).__version__}" for name in _HARD)
 
 
 def _kernels() -> str:
@@ -347,7 +338,7 @@ def _in_process(code: str) -> dict[str, Any]:
 
 
 _LIBRARY: dict[str, Callable[[], str]] = {
-    "python": _python,
+    "python": lambda: f"{platform.python_version()}, {platform.system()} {platform.machine()}",
     "difflcs": lambda: difflcs.__version__,
     "packages": _hard_dependencies,
     "kernels": _kernels,

@@ -264,6 +264,7 @@ def _quiet() -> Iterator[None]:
 
 # Weight that makes λ unique where it moves no state. At 1e-3 diffcp's gradient of such a λ is off by 1 % and more.
 _TIE = 1e-2
+_STEPS = 3  # of Newton, to polish a plan
 _PLAIN = ("A", "B", "C", "d", "D", "E", "F", "c", "u_min", "u_max", "x0")
 
 
@@ -374,9 +375,7 @@ def _root(matrix: Tensor) -> Tensor:
 
 
 @_one_thread()
-def _polish(
-    problem: MPCProblem, u: Tensor, lam: Tensor, mu: Tensor, *row: Tensor, steps: int = 3
-) -> tuple[Primal, Tensor]:
+def _polish(problem: MPCProblem, u: Tensor, lam: Tensor, mu: Tensor, *row: Tensor) -> tuple[Primal, Tensor]:
     """Improve a plan by Newton steps on the program with its active bounds held; each element keeps its best point.
 
     A conic solver is accurate only to its tolerance, which shows in difference quotients.
@@ -387,13 +386,12 @@ def _polish(
         lam: (batch, H, n_lam) solver's λ.
         mu: (batch, H, n_lam) solver's multiplier of s ≥ 0.
         row: α, β, γ of the penalty.
-        steps: number of Newton steps.
 
     Returns:
         The trajectory with exact dynamics, bounds and λ ≥ 0, and its residual (batch,), NaN where the solver gave none.
     """
     best = point = _Point.at(problem, u, lam, mu, *row)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         point = _Point.at(problem, *point.newton(problem), *row)
         better = point.residual < best.residual
         primal = (torch.where(better[:, None, None], a, b) for a, b in zip(point.primal, best.primal, strict=True))
@@ -460,17 +458,8 @@ class _Point:
         projected = z - (z - gradient + matvec(S.mT, mu)).clamp(low, high)
         worst = torch.cat([projected, torch.minimum(s, mu)], 1).abs().amax(-1) / size
         residual = torch.maximum(worst, (-s).amax(-1))
-        return cls(
-            Primal(torch.stack(x, 1), u, lam, problem.no_multipliers()),
-            mu,
-            s,
-            S,
-            gradient,
-            hessian,
-            low,
-            high,
-            residual,
-        )
+        primal = Primal(torch.stack(x, 1), u, lam, problem.no_multipliers())
+        return cls(primal, mu, s, S, gradient, hessian, low, high, residual)
 
     def newton(self, problem: MPCProblem) -> tuple[Tensor, Tensor, Tensor]:
         """Compute u, λ and multiplier of s ≥ 0 that solve the program if its active constraints are those here."""
