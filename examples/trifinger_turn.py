@@ -30,6 +30,7 @@ from difflcs import LCSMPCLayer
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Effort, MujocoCost, MujocoLCS, Orientation, Position
+from difflcs.planning.mujoco import Rehearsal
 from difflcs.rl import wilson_interval
 
 HEIGHTS = {  # of the objects' centres at the start and at the goal, as published [m]
@@ -161,7 +162,7 @@ class Policy:
         s, model = settings, model.__copy__()
         self.twin.opt.timestep, self.twin.opt.tolerance = 0.004, 1e-5
         self.twin.geom_condim[:] = np.minimum(self.twin.geom_condim, 4)
-        self.tried = mujoco.MjData(self.twin)
+        self.trials = Rehearsal(self.twin, SECONDS, self.miss, s.gain, s.slack)
         model.body_inertia[model.body("obj").id] *= s.inertia
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.module = MujocoLCS(
@@ -280,24 +281,11 @@ class Policy:
         begun = time.thread_time()
         points = self.around(data)
         action = self.mpc.step(self.module.observe(data), np.concatenate([self.place, self.goal, *points]))
-        move = self.rehearse(data, np.clip(action / s.pace, -LIMIT, LIMIT))
+        move = np.clip(action / s.pace, -LIMIT, LIMIT)
+        tries = [data.qpos[7:] + pace * move for pace in s.paces or (1.0,)]
+        target = self.trials.choose(data, tries) if s.paces else tries[0]
         self.times.append(1e3 * (time.thread_time() - begun))
-        return data.qpos[7:] + move
-
-    def rehearse(self, data: Any, move: np.ndarray) -> np.ndarray:
-        """Try a step at some paces in MuJoCo: the fastest that ends about as well as the best."""
-        s, ends = self.settings, []
-        if not s.paces:
-            return move
-        now = self.miss(data)
-        for pace in s.paces:
-            mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-            self.tried.ctrl[:] = data.qpos[7:] + pace * move
-            mujoco.mj_step(self.twin, self.tried, round(SECONDS / self.twin.opt.timestep))
-            ends.append(self.miss(self.tried))
-            if ends[-1] < now - s.gain:
-                break
-        return next(pace for pace, end in zip(s.paces, ends, strict=False) if end <= min(ends) + s.slack) * move
+        return target
 
     def miss(self, data: Any) -> float:
         """Cost of the object's place and tilt, 0.1 s later if nothing stops it, and of its orientation."""

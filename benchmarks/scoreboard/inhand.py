@@ -40,6 +40,7 @@ from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import Effort, MujocoCost, Orientation, Position
+from difflcs.planning.mujoco import Rehearsal
 from difflcs_envs.tasks import hand_system
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
@@ -171,11 +172,11 @@ class HandPolicy:
     """Contact MPC: a quasi-dynamic system and a cost in task space, both linearised where hand and object are."""
 
     def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
-        s = settings
+        self.settings = s = settings
         self.twin, self.place, model = copy.copy(model), place, copy.copy(model)
         self.twin.opt.timestep, self.twin.opt.impratio, self.twin.opt.tolerance = SECONDS / TRIALS, 1.0, 1e-5
         self.twin.geom_condim[:] = np.minimum(self.twin.geom_condim, 4)  # nothing rolls far
-        self.tried = mujoco.MjData(self.twin)
+        self.trials = Rehearsal(self.twin, SECONDS, self.miss, s.gain, s.slack, s.worse)
         model.body_inertia[model.body("obj").id] *= s.inertia
         mujoco.mj_setConst(model, mujoco.MjData(model))  # simple bodies have it twice
         self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
@@ -193,7 +194,6 @@ class HandPolicy:
         )
         solver, far = BatchedBackend(restarts=1, threads=1), s.pace * self.limit
         self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
-        self.settings = settings
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
         self.geom, self.spots = model.geom("obj").id, np.zeros((4, 3))
         self.aim(goal)
@@ -251,27 +251,12 @@ class HandPolicy:
 
     def rehearse(self, data: Any, action: np.ndarray) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s: a step at the faster pace if it ends about as well, or none."""
-        s, now, tries, ends = self.settings, self.miss(data), [], []
-        for pace in s.paces if s.paces and self.waited >= 0 else (1.0,):
-            tries.append(data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit))
-            safe = not s.paces or (ends != [] and now + s.slack < ends[-1] < now + s.worse)  # mostly better than it
-            ends.append(now if safe else self.simulate(data, tries[-1]))
-            if ends[-1] < now - s.gain:
-                break
-        if min(ends) > now + s.worse:
-            tries.append(self.ctrl)
-            ends.append(self.simulate(data, self.ctrl))
-        last, self.ctrl = self.ctrl, next(t for t, end in zip(tries, ends, strict=True) if end <= min(ends) + s.slack)
+        paces = self.settings.paces if self.waited >= 0 and self.settings.paces else (1.0,)
+        tries = [data.qpos[:16] + np.clip(pace * action, -self.limit, self.limit) for pace in paces]
+        last, self.ctrl = self.ctrl, self.trials.choose(data, tries, self.ctrl) if self.settings.paces else tries[0]
         if self.ctrl is last and self.waited < 0:  # to open in this way does harm
             self.posture = JOINTS + 0.3 * self.random.randn(16)
         return self.ctrl
-
-    def simulate(self, data: Any, ctrl: np.ndarray) -> float:
-        """Return the cost at the end of a step."""
-        mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-        self.tried.ctrl[:] = ctrl
-        mujoco.mj_step(self.twin, self.tried, TRIALS)
-        return self.miss(self.tried)
 
     def miss(self, data: Any) -> float:
         """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""

@@ -1,11 +1,11 @@
-"""Places round a body of any MuJoCo model, and paths of end effectors that are on slides or at the end of an arm.
+"""Places round a body of any MuJoCo model, paths of end effectors on slides or arms, and trials before it moves.
 
 Needs the extra `envs`. MuJoCo's kinematics say where end effectors are, and the gaps of the `MujocoLCS` itself what is
 free of collisions: what may not touch there is not in the way.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -17,7 +17,7 @@ from difflcs._checks import check_kind, check_list, check_number, check_positive
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoCost, MujocoLCS, Position
 
-__all__ = ["BodyPlaces", "BodyTravel"]
+__all__ = ["BodyPlaces", "BodyTravel", "Rehearsal"]
 
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEAST = 0.3  # of the clearance, that must be left on the way
@@ -257,3 +257,69 @@ class BodyTravel:
         room = torch.where(go > stay, high - stay, low - stay) / (go - stay)
         part = room[(go - stay).abs() > 1e-12].clamp(0.0, 1.0)
         return (stay + part.amin() * (go - stay) if len(part) else stay).clamp(low, high)
+
+
+class Rehearsal:
+    """Controls tried in a simulator before one is executed: the first is taken that ends about as well as the best.
+
+    A linear system may promise what contacts do not keep. A trial tells, for some steps of the simulator.
+
+    Args:
+        model: MuJoCo's, with the time step and options of the trials; those of the robot's simulator may be finer.
+        seconds: duration of a trial [s].
+        cost: MuJoCo's data → cost of its state.
+        gain: a control that ends better than now by this is taken, and no further one is tried.
+        slack: cost by which the control that is taken may end worse than the best.
+        harm: where a control ends worse than now, but by less than this, the next is trusted to do no harm, untried;
+            where all end worse by more, staying is tried, too. 0: each control is tried.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        seconds: float,
+        cost: Callable[[Any], float],
+        gain: float,
+        slack: float = 0.0,
+        harm: float = 0.0,
+    ):
+        self.model = check_kind("model", model, mujoco.MjModel, "pass the model of the trials")
+        self.steps = round(check_number("seconds", seconds, strict=True) / model.opt.timestep)
+        self.cost = cost
+        self.gain, self.slack, self.harm = (
+            check_number(name, value) for name, value in (("gain", gain), ("slack", slack), ("harm", harm))
+        )
+        self._data = mujoco.MjData(model)
+
+    def choose(self, data: Any, controls: Sequence[np.ndarray], stay: np.ndarray | None = None) -> np.ndarray:
+        """Choose one of some controls.
+
+        Args:
+            data: MuJoCo's, where the robot is.
+            controls: (nu,) each, the boldest first.
+            stay: (nu,) of staying, see `harm`; None: it is no choice.
+
+        Returns:
+            One of them, the very array.
+        """
+        now, tried, ends = self.cost(data), [], []
+        for control in controls:
+            trusted = ends != [] and now + self.slack < ends[-1] < now + self.harm
+            tried.append(control)
+            ends.append(now if trusted else self.end(data, control))
+            if ends[-1] < now - self.gain:
+                break
+        if stay is not None and min(ends) > now + self.harm:
+            tried.append(stay)
+            ends.append(self.end(data, stay))
+        return next(control for control, end in zip(tried, ends, strict=True) if end <= min(ends) + self.slack)
+
+    def end(self, data: Any, control: np.ndarray) -> float:
+        """Return the cost of the state in which a control (nu,) ends."""
+        mujoco.mj_copyState(self.model, data, self._data, mujoco.mjtState.mjSTATE_INTEGRATION)
+        self._data.ctrl[:] = control
+        mujoco.mj_step(self.model, self._data, self.steps)
+        return self.cost(self._data)

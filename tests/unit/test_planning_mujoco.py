@@ -1,12 +1,13 @@
-"""Places and ways of end effectors of MuJoCo models: on slides, and at the end of an arm."""
+"""Places and ways of end effectors of MuJoCo models, on slides and at the end of an arm, and trials of controls."""
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoLCS
-from difflcs.planning.mujoco import BodyPlaces, BodyTravel
+from difflcs.planning.mujoco import BodyPlaces, BodyTravel, Rehearsal
 from tests.conftest import refuse
 
 WORLD = """<mujoco><compiler angle="radian"/><worldbody>
@@ -53,3 +54,30 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
     assert travel.arrived(x, target)
     refuse(InvalidInputError, "effectors: expected", BodyPlaces, module, "box", ["box"])
     refuse(InvalidInputError, "may touch the body None", BodyPlaces, module, None, ["tip"])
+
+
+@pytest.mark.parametrize(
+    ("controls", "options", "chosen", "tried"),
+    [
+        ([20, 10, 5], {}, 10, 3),
+        ([9, 10], {"slack": 0.2}, 9, 2),
+        ([9, 10], {"gain": 0.5}, 9, 1),
+        ([22, 3], {"harm": 0.5}, 3, 1),  # a little harm: the next is trusted
+        ([-20, -10], {"harm": 0.5}, 0, 3),  # all do harm: it stays
+    ],
+)
+def test_of_controls_that_are_tried_the_first_that_ends_about_as_well_as_the_best_is_taken(
+    controls, options, chosen, tried
+):
+    body = '<body><joint type="slide" damping="1"/><geom size=".1" mass="1e-6"/></body>'
+    world = f'<worldbody>{body}</worldbody><actuator><motor joint="slide"/></actuator>'.replace(
+        "<joint", "<joint name='slide'"
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><option gravity='0 0 0' timestep='.01'/>{world}</mujoco>")
+    ends, options = [], {"gain": 3.0, **options}
+    rehearsal = Rehearsal(model, 0.1, lambda data: ends.append(data.time) or abs(data.qpos[0] - 1), **options)
+    data = mujoco.MjData(model)
+    arrays = [np.array([float(control)]) for control in controls]
+    assert rehearsal.choose(data, arrays, np.zeros(1)) == chosen
+    assert (np.round(ends, 9).tolist(), data.time) == ([0.0] + [0.1] * tried, 0.0)
+    refuse(InvalidInputError, "seconds: expected", Rehearsal, model, 0.0, len, 0.0)
