@@ -288,11 +288,10 @@ class Rehearsal:
     ):
         self.model = check_kind("model", model, mujoco.MjModel, "pass the model of the trials")
         self.steps = round(check_number("seconds", seconds, strict=True) / model.opt.timestep)
-        self.cost = cost
+        self.cost, self._data = cost, mujoco.MjData(model)
         self.gain, self.slack, self.harm = (
             check_number(name, value) for name, value in (("gain", gain), ("slack", slack), ("harm", harm))
         )
-        self._data = mujoco.MjData(model)
 
     def choose(self, data: Any, controls: Sequence[np.ndarray], stay: np.ndarray | None = None) -> np.ndarray:
         """Choose one of some controls.
