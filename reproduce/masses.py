@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import report
 from records import Cell, select
-from report import Tables, say
-from table1 import LABELS, PAPER, below, beyond_paper
+from report import Tables
+from table1 import LABELS, PAPER, below, beyond_paper, column
 from units import MASSES, OBJECTS
 
 WHEN: dict[str, str | float] = {"6 min": 6.0, "final": "final"}
@@ -25,8 +25,7 @@ def table(cells: Cells) -> pd.DataFrame:
     columns = {"object": [*LABELS, "all six"]}
     for label, when in WHEN.items():
         for mass, results in cells.items():
-            shown = [*(report.at(cell, when) for cell in results), report.over_objects(results, when)]
-            columns[f"{label}: {mass}"] = [say(one) for one in shown]
+            columns[f"{label}: {mass}"] = column(results, when)
     theirs = (PAPER[task]["lcs-rl", "final"] for task in OBJECTS)
     columns["final: paper"] = [*(f"{mean:.1f} ± {sd:.1f}" for mean, sd in theirs), report.MISSING]
     return pd.DataFrame(columns)

@@ -59,7 +59,7 @@ def success(cells: Mapping[str, Cells]) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def column(cells: Cells, when: str) -> list[str]:
+def column(cells: Cells, when: str | float) -> list[str]:
     """Make the column of success on each object and on all."""
     return [say(value) for value in (*(report.at(cell, when) for cell in cells), report.over_objects(cells, when))]
 

@@ -35,6 +35,9 @@ class ContactLCS(nn.Module):
             and its `drive_compliance` (each disc), and `outline`: each side of a polygon moves along its normal, each
             circle has another radius.
 
+    Attributes:
+        n_x, n_u, n_lam: numbers of states, actions and contact forces.
+
     Raises:
         DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, gain or compliance of
             another drive, or friction or a compliance of the drive where there is none.
@@ -65,6 +68,7 @@ class ContactLCS(nn.Module):
                 "it out"
             )
         self.guess = physics
+        self.n_x, self.n_u, self.n_lam = physics.n_x, physics.n_u, physics.n_lam
         discs = physics.n_discs
         sizes = {
             "center_of_mass": (2,),
@@ -79,21 +83,6 @@ class ContactLCS(nn.Module):
         self.change = nn.ParameterDict(
             {name: nn.Parameter(torch.zeros(sizes[name], dtype=torch.float64)) for name in self.learn}
         )
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.guess.n_x
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self.guess.n_u
-
-    @property
-    def n_lam(self) -> int:
-        """Number of contact forces."""
-        return self.guess.n_lam
 
     @property
     def physics(self) -> PlanarPushing:

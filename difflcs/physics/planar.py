@@ -148,13 +148,10 @@ class PDDrive(Drive):
             -2,
         )
         M = torch.linalg.matrix_power(M, substeps)
-        # target = p + u, and p moves with the target where both are shifted.
-        return DriveStep(M[..., :2, :2] + _first_column(M[..., :2, 2]), M[..., :2, 2], torch.zeros_like(M[..., :2, 2]))
-
-
-def _first_column(b: Tensor) -> Tensor:
-    """Make a matrix whose first column is b, for the effect of p on an action u = target − p."""
-    return torch.stack([b, torch.zeros_like(b)], -1)
+        b = M[..., :2, 2]
+        zero = torch.zeros_like(b)
+        # target = p + u, and p moves with the target where both are shifted: what the target does, p does, too.
+        return DriveStep(M[..., :2, :2] + torch.stack([b, zero], -1), b, zero)
 
 
 @dataclass(frozen=True, eq=False)

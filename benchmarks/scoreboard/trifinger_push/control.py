@@ -124,9 +124,6 @@ class TipReference:
         half = self.acceleration * STEP / 2
         brake = np.sqrt(half**2 + 2 * self.acceleration * distance) - half
         wanted = gap / np.maximum(distance, 1e-9) * np.minimum(np.minimum(self.speed, brake), distance / STEP)
-        return self._advance(wanted)
-
-    def _advance(self, wanted: Array) -> tuple[Array, Array, Array]:
         change = wanted - self.velocity
         size = np.linalg.norm(change, axis=1, keepdims=True)
         a = change * np.minimum(1, self.acceleration * STEP / np.maximum(size, 1e-9)) / STEP
