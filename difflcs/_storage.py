@@ -8,7 +8,7 @@ import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -54,18 +54,27 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # a full disk names no file
+            error.filename = str(path)
         raise
 
 
 @contextmanager
-def place_to_write(path: Path) -> Iterator[None]:
+def place_to_write(path: Path, name: str = "out") -> Iterator[None]:
     """Turn what the system says of files that cannot be written into an error of ours."""
     try:
         yield
     except OSError as error:
-        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
+        raise InvalidInputError(f"{name}: expected a place to write {path}, got: {error}; choose another") from error
+
+
+def check_place(name: str, folder: Path) -> None:
+    """Refuse, before long work, a folder that cannot be written or made; nothing is left there."""
+    with place_to_write(folder, name):
+        nearest = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+        tempfile.TemporaryFile(dir=nearest).close()
 
 
 def write_json(path: Path, value: object) -> None:
@@ -80,28 +89,25 @@ def read_text(path: Path) -> str:
         FileNotFoundError: there is none.
         CheckpointError: it is not a file, too large, not UTF-8, or cannot be read.
     """
-    _check_size(path, MAX_TEXT)
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise
-    except (OSError, UnicodeDecodeError) as error:
+        return read_bytes(path, MAX_TEXT).decode()
+    except UnicodeDecodeError as error:
         raise CheckpointError(f"{path}: expected text that can be read, got {error}; restore it from a copy") from error
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a file of numbers.
+def read_bytes(path: Path, limit: int = MAX_TENSORS) -> bytes:
+    """Read a file of at most `limit` bytes.
 
     Raises:
         FileNotFoundError: there is none.
         CheckpointError: it is not a file, too large, or cannot be read.
     """
-    _check_size(path, MAX_TENSORS)
     try:
+        _check_size(path, limit)
         return path.read_bytes()
     except FileNotFoundError:
         raise
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a path may have a NUL
         raise CheckpointError(f"{path}: expected a readable file, got {error}; restore it from a copy") from error
 
 
@@ -132,32 +138,19 @@ def _finite(text: str) -> float:
     return value
 
 
-def _is_flat(value: object) -> bool:
-    level = [value]
-    for _ in range(_MAX_DEPTH):
-        level = [v for part in level if isinstance(part, dict | list) for v in _children(part)]
-        if not level:
-            return True
-    return False
-
-
-def _children(part: dict | list) -> Iterable[object]:
-    return part.values() if isinstance(part, dict) else part
+def _is_flat(value: object, levels: int = _MAX_DEPTH) -> bool:
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return levels > 0 and all(_is_flat(part, levels - 1) for part in parts)
 
 
 def _check_size(path: Path, limit: int) -> None:
     """Refuse anything but a plain file (a pipe would never end), and one that is too large.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        OSError, ValueError: of the system, about the path.
         CheckpointError: see above.
     """
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: expected a readable file, got {error}; restore it from a copy") from error
+    status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: expected a plain file, got another kind; restore it from a copy")
     if status.st_size > limit:
@@ -259,11 +252,11 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
 def _read_tensors(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
     from safetensors import safe_open
 
-    _check_size(path, MAX_TENSORS)
     try:
+        _check_size(path, MAX_TENSORS)
         with safe_open(path, "pt") as file:
             return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}
-    except FileNotFoundError:
+    except (FileNotFoundError, CheckpointError):
         raise
     except Exception as error:  # the format has many ways to be wrong, and dtypes that torch does not know
         raise CheckpointError(f"{path}: expected tensors, got {type(error).__name__}: {error}") from error

@@ -10,7 +10,7 @@ from typing import Any
 
 from difflcs import zoo
 from difflcs._optional import require, versions
-from difflcs._storage import place_to_write
+from difflcs._storage import check_place, place_to_write
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.export import CONTROLLER, DESCRIPTION, export_controller
@@ -46,6 +46,8 @@ class Evaluate:
     def run(self) -> None:
         """Run the command."""
         goals = min(self.goals, _SMOKE_GOALS) if self.smoke else self.goals
+        if self.plot is not None:
+            check_place("plot", self.plot)
         learned = TrainedPolicy.open(self.model)
         task = get_task(learned.task)
         bounds = (None, None)
@@ -124,6 +126,7 @@ class Render:
             raise InvalidInputError(
                 f"out: expected a new file, got {self.out}, which exists; pass --force to replace it, or another --out"
             )
+        check_place("out", self.out.parent)
         learned = TrainedPolicy.open(self.model)
         task = get_task(learned.task)
         goals = self._goals(task)
@@ -162,6 +165,7 @@ class Plot:
         """Run the command."""
         learned = TrainedPolicy.open(self.model)
         out = self.out or (Path() if learned.run is None else learned.run.path)
+        check_place("out", out)
         written = []
         if learned.run is not None and (rows := learned.run.rows()):
             written.append(out / "learning_curve.png")

@@ -68,7 +68,9 @@ class Train(TrainConfig):
 
     def interrupted(self) -> str:
         """Return the advice after Ctrl-C."""
-        return f"continue with: difflcs train --out {self.directory(self.out)} --resume"
+        out = self.directory(self.out)
+        begun = (out / "config.json").is_file()
+        return f"continue with: difflcs train --out {out} --resume" if begun else "nothing was changed"
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

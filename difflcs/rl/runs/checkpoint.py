@@ -56,6 +56,9 @@ def save_checkpoint(root: Path, iteration: int, state: State, keep: int = 2) -> 
     _storage.write_json(root / "latest.json", {"checkpoint": name})
     for old in sorted(n for n in _numbered(root) if int(n) <= iteration)[:-keep]:
         shutil.rmtree(root / old, ignore_errors=True)
+    for left in root.glob(".*.tmp"):  # by a process that was killed; a directory or a file
+        shutil.rmtree(left, ignore_errors=True)
+        left.unlink(missing_ok=True)
 
 
 def load_checkpoint(root: Path) -> dict[str, Any]:
@@ -155,7 +158,7 @@ class RunDirectory:
         if path.exists() and (not path.is_dir() or any(entry.name != _storage.LOCK for entry in path.iterdir())):
             raise CheckpointError(
                 f"{path}: expected a new or empty directory, found files; "
-                f"pass --resume to continue the run in it, or choose another --out"
+                f"if it is a run, continue it with --resume, or choose another --out"
             )
 
     def locked(self) -> AbstractContextManager[None]:
@@ -275,9 +278,11 @@ def wrap_os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        begun = os.path.isfile(path / "checkpoints/latest.json")
+        remedy = "go on with --resume (the last checkpoint is intact)" if begun else "try again"
         raise CheckpointError(
-            f"{path}: expected a folder with free space that can be written, got: {error}; mend that and go on with "
-            f"--resume, or choose another --out. The last checkpoint is intact"
+            f"{path}: expected a folder with free space that can be written, got: {error}; mend that and {remedy}, or "
+            f"choose another --out"
         ) from error
 
 

@@ -136,7 +136,6 @@ def _write(figure: Figure, path: Path) -> None:
     from difflcs._figure import to_png
 
     with place_to_write(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, to_png(figure))
 
 

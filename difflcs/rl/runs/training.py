@@ -281,7 +281,7 @@ class _Training:
             self._loop(run, trainer, open_envs, fresh=state is None)
         finally:
             if refused:
-                (run.path / "config.json").unlink()
+                (run.path / "config.json").unlink(missing_ok=True)
             for envs in self.opened:
                 envs.close()
         return run
@@ -319,7 +319,9 @@ class _Training:
 
         config, per_minute, reporter = self.config, self.task.steps_per_minute, self.reporter
         columns = _columns(config.method)
-        run.truncate_log(-1 if fresh else trainer.iteration)
+        with wrap_os_errors(run.path):
+            run.truncate_log(-1 if fresh else trainer.iteration)
+            writer = SummaryWriter(str(run.tensorboard), purge_step=0 if fresh else trainer.env_steps + 1)
         begun = "training" if fresh else f"continuing after {trainer.env_steps / per_minute:.1f} min of data"
         _LOG.info(
             "%s: %s on %s, %g min of data, in %s", begun, config.method.name, config.task, config.minutes, run.path
@@ -358,7 +360,6 @@ class _Training:
                 _LOG.info("after %.1f min of data: %s", minutes, result.summary())
                 reporter.evaluated(minutes, result)
 
-        writer = SummaryWriter(str(run.tensorboard), purge_step=0 if fresh else trainer.env_steps + 1)
         try:
             if fresh:
                 finish(None, previous=-1)
@@ -368,7 +369,8 @@ class _Training:
             with wrap_os_errors(run.path):
                 save_learned(trainer.learned, run.model, self.config.method.kind)
         finally:
-            writer.close()
+            with wrap_os_errors(run.path):
+                writer.close()
 
 
 def _check_times(config: TrainConfig) -> None:
@@ -386,7 +388,8 @@ def _record_object(run: RunDirectory, current: Mapping[str, Any]) -> None:
     config = run.config()
     stored = config.get("object")
     if stored is None and current:
-        write_json(run.path / "config.json", {**config, "object": dict(current)})
+        with wrap_os_errors(run.path):
+            write_json(run.path / "config.json", {**config, "object": dict(current)})
     elif stored is not None and stored != dict(current):
         raise CheckpointError(
             f"{run.path}: expected the environment it was started with, {stored}, got {dict(current)}; set up the same"
