@@ -75,18 +75,22 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
             f"{root}: expected latest.json, found none; was this written by `difflcs train`?"
         ) from None
     except CheckpointError as error:
-        raise CheckpointError(f"{error.args[0]}; or write one of {sorted(_numbered(root))} into it") from error
+        raise CheckpointError(
+            f'{error.args[0]}; or write {{"checkpoint": "N"}} into it, N of {sorted(_numbered(root))}'
+        ) from error
     name = content.get("checkpoint") if isinstance(content, dict) else None
     if not isinstance(name, str) or not _is_number(name):
         raise CheckpointError(
             f'{latest}: expected {{"checkpoint": "<number>"}}, got {_storage.short(content)}; '
-            f"write one of {sorted(_numbered(root))} into it"
+            f"write one of {sorted(_numbered(root))} into it as that number"
         )
     try:
         return _load(root / name, int(name))
     except CheckpointError as error:
         older = sorted(_numbered(root) - {name})
-        remedy = f"to go back to an older one, write one of {older} into {latest}" if older else "start anew"
+        remedy = (
+            f'to go back to {older[-1]}, write {{"checkpoint": "{older[-1]}"}} into {latest}' if older else "start anew"
+        )
         raise CheckpointError(f"{error.args[0]}; {remedy}") from error
 
 

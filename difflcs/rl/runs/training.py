@@ -321,7 +321,6 @@ class _Training:
         columns = _columns(config.method)
         with wrap_os_errors(run.path):
             run.truncate_log(-1 if fresh else trainer.iteration)
-            writer = SummaryWriter(str(run.tensorboard), purge_step=0 if fresh else trainer.env_steps + 1)
         begun = "training" if fresh else f"continuing after {trainer.env_steps / per_minute:.1f} min of data"
         _LOG.info(
             "%s: %s on %s, %g min of data, in %s", begun, config.method.name, config.task, config.minutes, run.path
@@ -360,6 +359,8 @@ class _Training:
                 _LOG.info("after %.1f min of data: %s", minutes, result.summary())
                 reporter.evaluated(minutes, result)
 
+        with wrap_os_errors(run.path):
+            writer = SummaryWriter(str(run.tensorboard), purge_step=0 if fresh else trainer.env_steps + 1)
         try:
             if fresh:
                 finish(None, previous=-1)
