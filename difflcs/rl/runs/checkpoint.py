@@ -75,9 +75,8 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
             f"{root}: expected latest.json, found none; was this written by `difflcs train`?"
         ) from None
     except CheckpointError as error:
-        raise CheckpointError(
-            f'{error.args[0]}; or write {{"checkpoint": "N"}} into it, N of {sorted(_numbered(root))}'
-        ) from error
+        newest = max(_numbered(root), default="")
+        raise CheckpointError(f'{error.args[0]}; or write {{"checkpoint": "{newest}"}} into it') from error
     name = content.get("checkpoint") if isinstance(content, dict) else None
     if not isinstance(name, str) or not _is_number(name):
         raise CheckpointError(
@@ -87,10 +86,8 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
     try:
         return _load(root / name, int(name))
     except CheckpointError as error:
-        older = sorted(_numbered(root) - {name})
-        remedy = (
-            f'to go back to {older[-1]}, write {{"checkpoint": "{older[-1]}"}} into {latest}' if older else "start anew"
-        )
+        older = max(_numbered(root) - {name}, default=None)
+        remedy = f'to go back, write {{"checkpoint": "{older}"}} into {latest}' if older else "start anew"
         raise CheckpointError(f"{error.args[0]}; {remedy}") from error
 
 
