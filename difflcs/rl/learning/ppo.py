@@ -232,10 +232,10 @@ class PPO(Trainer):
         std, step_size = float(self.actor.std.mean()), self.update.size.value
         real_scale = scale if self.models is None else self.models.settings.real_step * scale
         outcome = self._iterate(self.robot, seeds, (), real_scale, after_step)
+        episodes, improvement = outcome.episodes, outcome.improvement
         if self.models is not None:
             self.update.size.value = step_size  # it follows the model rollouts alone
-        episodes, improvement = outcome.episodes, outcome.improvement
-        self.remember(episodes)
+            self.models.add(episodes)
         kept = self.incumbent
         accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
         self.iteration += 1
