@@ -50,6 +50,15 @@ def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     assert trainer.update.size.value == 3.0 == report.learning_rate
 
 
+def test_real_episodes_are_tested_once():
+    trainer, sizes = make_practising(models={"iterations": 1, "steps": 1}, steps=1, gain=-1.65), []
+    challenge = trainer.incumbent.challenge
+    trainer.incumbent.challenge = lambda starts, *rest: sizes.append(len(starts)) or challenge(starts, *rest)
+    for _ in range(2):
+        trainer.step()
+    assert sizes == [ROLLOUTS, ROLLOUTS]
+
+
 def success(trainer) -> float:
     while not trainer.done:
         trainer.step()
