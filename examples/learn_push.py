@@ -81,6 +81,12 @@ def guess(true: PlanarPushing, seed: int) -> ContactLCS:
     return ContactLCS(frozen(model.physics), learn=LEARNED)
 
 
+def touches(shape: Union, part: int, points: Tensor) -> Tensor:
+    """Return a mask (...) of points (..., 2) of a part that lie at or in another one."""
+    others = [other.distance(points).distance.amin(-1) for i, other in enumerate(shape.parts) if i != part]
+    return torch.stack([*others, torch.ones(points.shape[:-1]).double()]).amin(0) <= 1e-6
+
+
 def joined(physics: PlanarPushing) -> Tensor:
     """Return a mask of the sides that lie at or in another part from corner to corner: no disc ever touches them."""
     assert isinstance(physics.shape, Union)
@@ -89,8 +95,7 @@ def joined(physics: PlanarPushing) -> Tensor:
         assert isinstance(part, Polygon)
         ends = part.vertices
         points = torch.stack([ends, (ends + ends.roll(-1, 0)) / 2, ends.roll(-1, 0)])
-        others = [other.distance(points).distance.amin(-1) for j, other in enumerate(physics.shape.parts) if j != i]
-        inside.append((torch.stack([*others, torch.ones(points.shape[:-1]).double()]).amin(0) < 1e-6).all(0))
+        inside.append(touches(physics.shape, i, points).all(0))
     return torch.cat(inside)
 
 
@@ -197,8 +202,7 @@ def corners(physics: PlanarPushing, true: PlanarPushing) -> list[float]:
     for i, (learned, part) in enumerate(zip(physics.shape.parts, true.shape.parts, strict=True)):
         assert isinstance(learned, Polygon)
         assert isinstance(part, Polygon)
-        others = [other.distance(part.vertices).distance.amin(-1) for j, other in enumerate(true.shape.parts) if j != i]
-        outside = torch.stack([*others, torch.ones(len(part.vertices)).double()]).amin(0) > 1e-6
+        outside = ~touches(true.shape, i, part.vertices)
         apart.append(PIXELS * (learned.vertices - part.vertices)[outside].norm(dim=1))
     return torch.cat(apart).tolist()
 

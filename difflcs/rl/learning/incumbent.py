@@ -124,4 +124,4 @@ def distance(actor: GaussianPolicy, episodes: Any) -> float:
     old = episodes["policy"].flatten(0, 1)
     with torch.no_grad():
         new: Any = actor.solve(old.select(*actor.in_keys, CONTEXT, strict=False))
-        return trimmed_mean(gaussian_kl(old, new), 0.97)
+        return trimmed_mean(gaussian_kl(old, new))

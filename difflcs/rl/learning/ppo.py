@@ -373,7 +373,7 @@ class PPO(Trainer):
             outcome.solve_seconds += solved - start
 
             kl = gaussian_kl(old, new)
-            outcome.kl = trimmed_mean(kl, 0.97)
+            outcome.kl = trimmed_mean(kl)
             if not outcome.kl <= self.max_kl and outcome.steps:
                 break
             loss = self.surrogate(new, old, kl, cast("TensorDict", samples[chosen]), episodes, rng)

@@ -117,6 +117,6 @@ def _log_det(factor: Tensor) -> Tensor:
     return factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def trimmed_mean(values: Tensor, fraction: float) -> float:
-    """Mean of the lowest `fraction` of the values, at least of one."""
+def trimmed_mean(values: Tensor, fraction: float = 0.97) -> float:
+    """Mean of the lowest `fraction` of the values, at least of one; by default that of KL divergences."""
     return float(values.sort().values[: max(1, int(fraction * len(values)))].mean())
