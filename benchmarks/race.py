@@ -20,7 +20,7 @@ import torch
 import tyro
 from race_global import global_gaps
 from race_hard import measure, tune
-from race_problems import RELAXATION, small, with_contact, without_contact
+from race_problems import RELAXATION, as_mpc, small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
@@ -165,13 +165,17 @@ class Process:
         return json.loads(line) if line else {"error": f"the process ended with code {self.process.wait()}"}
 
     def ask(self, **job: object) -> dict:
-        """Send a job and return its answer."""
+        """Send a job; return its answer, with the arrays that the rival has written into the file `out`."""
         assert self.process.stdin
         if self.process.poll() is not None:
             return {"error": f"the process ended with code {self.process.returncode}"}
         self.process.stdin.write(json.dumps(job) + "\n")
         self.process.stdin.flush()
-        return self._answer()
+        answer = self._answer()
+        if "error" not in answer:
+            with np.load(str(job["out"])) as file:
+                answer |= dict(file)
+        return answer
 
     def close(self) -> None:
         """End the process."""
@@ -188,17 +192,6 @@ def start(entries: tuple[Entry, ...], venvs: Path, folder: str) -> list[Process]
 
 
 # --- judging ----------------------------------------------------------------------------------------------------------
-
-
-def as_mpc(problem: Problem, few: slice | None = None) -> MPCProblem:
-    """Convert the problem, or some of its elements, to an `MPCProblem`."""
-    data = {}
-    for name in ("A", "B", "C", "d", "D", "E", "F", "c", "Q", "R", "Q_final", "q", "r", "q_final", "u_min", "u_max"):
-        value = torch.from_numpy(np.ascontiguousarray(getattr(problem, name)))
-        rank = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
-        data[name] = value[few] if few is not None and value.ndim > rank else value
-    x0 = torch.from_numpy(problem.x0 if few is None else problem.x0[few])
-    return MPCProblem(**data, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
 
 
 def best_known(problem: Problem, few: slice) -> torch.Tensor:
@@ -289,13 +282,8 @@ def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> 
             if "error" in best.get(label, {}):
                 continue
             answer = process.ask(problem=path, out=out, seconds=o.seconds, few=o.problems)
-            if "error" in answer:
+            if "error" in answer or label not in best:
                 best[label] = answer
-                continue
-            with np.load(out) as file:
-                arrays = dict(file)
-            if label not in best:
-                best[label] = {**answer, **arrays}
                 continue
             old, n = best[label], min(len(best[label]["times"]), len(answer["times"]))
             old["times"] = [min(a, b) for a, b in zip(old["times"][:n], answer["times"], strict=False)]
@@ -440,14 +428,9 @@ def globally(o: Options) -> dict[str, dict]:
         def optimum(problem: Problem) -> dict:
             path = f"{folder}/{len(os.listdir(folder))}.npz"
             problem.save(path)
-            job = {"problem": path, "out": f"{folder}/answer.npz", "few": problem.count}
-            answer = process.ask(**job, seconds=1e9)
-            if "error" not in answer:
-                with np.load(job["out"]) as file:
-                    answer |= dict(file)
-            return answer
+            return process.ask(problem=path, out=f"{folder}/answer.npz", few=problem.count, seconds=1e9)
 
-        outcome = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
+        outcome = global_gaps(small(o.small_problems, o.seeds), optimum, ours)
         process.close()
     return outcome
 
@@ -458,7 +441,7 @@ def main(o: Options) -> None:
         install(o.venvs)
         return
     if o.tune:
-        tune(as_mpc, o.tune, o.only)
+        tune(o.tune, o.only)
         return
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
@@ -467,7 +450,7 @@ def main(o: Options) -> None:
     options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        alone = {"global": globally, "planners": lambda o: measure(as_mpc, o.problems, o.seeds, o.rounds, o.only)}
+        alone = {"global": globally, "planners": lambda o: measure(o.problems, o.seeds, o.rounds, o.only)}
         old = results.get(name, {})
         results |= {name: alone[name](o)} if name in alone else dict(race(name, o))
         if name == "planners" and o.only:  # the rows of the others stay

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+from race_problems import as_mpc
 from rivals.problem import Problem
 
 from difflcs import solve_lcp
@@ -24,7 +25,6 @@ def global_gaps(
     problems: Iterator[tuple[str, Problem]],
     optimum: Callable[[Problem], dict],
     ours: dict[str, Callable[[Problem], torch.Tensor]],
-    as_mpc: Callable[[Problem], MPCProblem],
 ) -> dict[str, dict]:
     """Compute for each family the relative cost of `ours` above the proved optimum, [mean, worst].
 
@@ -32,7 +32,6 @@ def global_gaps(
         problems: family and problems.
         optimum: plans `u`, whether each is proved (`solved`) and `times`, by branch and bound.
         ours: name → actions.
-        as_mpc: function from a problem to an `MPCProblem`.
     """
     families: dict[str, dict] = {}
     for family, problem in problems:

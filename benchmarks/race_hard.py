@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 from race_global import hard_cost
-from race_problems import with_contact
+from race_problems import as_mpc, with_contact
 from rivals import admm, impact, layer, sampling
-from rivals.problem import Problem
-from rivals.run import closed_loop, cpu
+from rivals.problem import Problem, execute
+from rivals.run import cpu
 
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.mpc.problem import MPCProblem
 
 TUNED = Path(__file__).parent / "rivals" / "tuned.json"
 ITERATIONS = (3, 10, 30, 100)  # of C3+
@@ -75,24 +74,41 @@ def draws() -> dict[str, tuple[str, Draw]]:
     return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled((m,), 1024)) for m in ("cem", "mppi")}
 
 
-def objectives(problem: Problem, mpc: MPCProblem, u: np.ndarray) -> np.ndarray:
+def objectives(problem: Problem, u: np.ndarray) -> np.ndarray:
     """Compute the objectives of executing actions with λ·s = 0, their constant included."""
+    mpc = as_mpc(problem)
     return hard_cost(mpc, mpc.clip(torch.from_numpy(np.nan_to_num(u)))).numpy() + problem.constant
 
 
-def reference(problem: Problem, mpc: MPCProblem) -> np.ndarray:
+def reference(problem: Problem) -> np.ndarray:
     """Compute the hard objectives of our plans from many starts at two relaxations: the better ones."""
+    mpc = as_mpc(problem)
     plans = (BatchedBackend(restarts=32, max_iter=600).solve(mpc, None), BatchedBackend(effort="best").solve(mpc, None))
-    return np.minimum(*(objectives(problem, mpc, result.primal.u.numpy()) for result in plans))
+    return np.minimum(*(objectives(problem, result.primal.u.numpy()) for result in plans))
 
 
-def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float, only: tuple[str, ...] = ()) -> None:
+def closed_loop(rival: Any, few: int) -> tuple[float, np.ndarray]:
+    """Execute the first actions of plans, with hard contact, for some steps: seconds of a step, and costs (few,)."""
+    problem, costs, times = rival.problem, np.zeros(few), []
+    for i in range(few):
+        data, x = problem.only(i), problem.x0[i].copy()
+        start = x
+        for _ in range(STEPS):
+            seconds, u = cpu(lambda i=i, x=x: rival.step(i, x))
+            cost, x = execute(data, x, u[None])
+            costs[i] += cost
+            times.append(seconds)
+        problem.x0[i] = start
+    return float(np.median(times)), costs
+
+
+def tune(seconds: float, only: tuple[str, ...] = ()) -> None:
     """Draw settings of each rival, or `only` some, for each family on other seeds, for some seconds; write the best."""
     tuned: dict[str, dict[str, dict]] = json.loads(TUNED.read_text()) if only else {}
     for family, problems in with_contact(3, 2, OTHER_SEEDS).items():
         every = {k: v for k, v in draws().items() if "exact" not in k or problems[0].n_lam <= MOST_EXACT}
         wanted = {k: v for k, v in every.items() if not only or k in only}
-        known = [reference(p, as_mpc(p)) for p in problems] if wanted else []
+        known = [reference(p) for p in problems] if wanted else []
         for label, (module, draw) in wanted.items():
             random, least, until = np.random.default_rng(0), np.inf, time.process_time() + seconds
             while time.process_time() < until:
@@ -100,7 +116,7 @@ def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float, only: tuple[st
                 for p, best in zip(problems, known, strict=True):
                     solver = MODULES[module].Solver(p, **settings)
                     u = np.concatenate([solver.one(i).u for i in range(p.count)])
-                    gaps.append(np.minimum(objectives(p, as_mpc(p), u) / best - 1, 3.0))
+                    gaps.append(np.minimum(objectives(p, u) / best - 1, 3.0))
                 if np.mean(gaps) < least:
                     least = float(np.mean(gaps))
                     tuned.setdefault(family, {})[label] = {"module": module, "settings": settings}
@@ -108,13 +124,10 @@ def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float, only: tuple[st
     TUNED.write_text(json.dumps(tuned, indent=1) + "\n")
 
 
-def measure(
-    as_mpc: Callable[[Problem], MPCProblem], problems: int, seeds: int, rounds: int, only: tuple[str, ...] = ()
-) -> dict[str, dict[str, dict]]:
+def measure(problems: int, seeds: int, rounds: int, only: tuple[str, ...] = ()) -> dict[str, dict[str, dict]]:
     """Measure every planner on the families of the race, or the first and `only` some.
 
     Args:
-        as_mpc: function from a problem to an `MPCProblem`.
         problems: of each model.
         seeds: models of a family.
         rounds: how often everybody solves everything, taking turns; the shortest time of each problem counts.
@@ -134,7 +147,7 @@ def measure(
             continue
         table = {label: {"times": [], "gaps": [], "steps": [], "costs": []} for label in planners}
         for problem in members:
-            mpc, found = as_mpc(problem), {}
+            found = {}
             solvers = {
                 label: MODULES[module].Solver(problem, **settings) for label, (module, settings) in planners.items()
             }
@@ -143,17 +156,17 @@ def measure(
                 for label, solver in solvers.items():
                     solved = [cpu(lambda i=i, solver=solver: solver.one(i)) for i in range(problems)]
                     times[label] = np.minimum(times[label], [seconds for seconds, _ in solved])
-                    found[label] = objectives(problem, mpc, np.concatenate([answer.u for _, answer in solved]))
-            best = np.minimum(np.min([*found.values()], axis=0), reference(problem, mpc))
+                    found[label] = objectives(problem, np.concatenate([answer.u for _, answer in solved]))
+            best = np.minimum(np.min([*found.values()], axis=0), reference(problem))
             for label, row in table.items():
                 row["times"] += list(times[label])
                 row["gaps"] += list(found[label] / best - 1)
             q, Q = np.broadcast_to(problem.q, (problems, problem.n_x)), problem.Q
             least = 0.5 * ((q @ np.linalg.pinv(Q)) * q).sum(1)  # makes the cost of a stage a sum of squares
             for label, solver in solvers.items() if family in LOOPS else ():
-                loop = closed_loop(solver, problems, STEPS)
-                table[label]["steps"].append(loop["seconds"])
-                table[label]["costs"] += list(np.array(loop["costs"]) + STEPS * least)
+                seconds, costs = closed_loop(solver, problems)
+                table[label]["steps"].append(seconds)
+                table[label]["costs"] += list(costs + STEPS * least)
         first = np.sum(table["difflcs"]["costs"])
         families[family] = {
             label: {

@@ -11,6 +11,7 @@ from models import pushing as pushing_instance
 from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
+from difflcs.mpc.problem import MPCProblem
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
 RELAXATION = 1e-5
@@ -30,6 +31,17 @@ def problem(instance: Instance, seed: int) -> Problem:
         **arrays, u_min=-bound, u_max=bound, x0=x0.numpy(), horizon=horizon, relaxation=RELAXATION,
         constant=constant, weight=weight,
     )  # fmt: skip
+
+
+def as_mpc(problem: Problem, few: slice | None = None) -> MPCProblem:
+    """Convert the problem, or some of its elements, to an `MPCProblem`."""
+    data = {}
+    for name in ("A", "B", "C", "d", "D", "E", "F", "c", "Q", "R", "Q_final", "q", "r", "q_final", "u_min", "u_max"):
+        value = torch.from_numpy(np.ascontiguousarray(getattr(problem, name)))
+        rank = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
+        data[name] = value[few] if few is not None and value.ndim > rank else value
+    x0 = torch.from_numpy(problem.x0 if few is None else problem.x0[few])
+    return MPCProblem(**data, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
 
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:

@@ -7,7 +7,6 @@ import importlib
 import importlib.util
 import json
 import os
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -33,24 +32,6 @@ def cpu(work: Callable[[], Any]) -> tuple[float, Any]:
     start = time.process_time()
     result = work()
     return time.process_time() - start, result
-
-
-def closed_loop(rival, few: int, steps: int) -> dict:
-    """Execute the first actions of plans, with hard contact, for some steps: the cost of each problem, and times."""
-    from rivals.problem import execute
-
-    problem, costs, times = rival.problem, [], []
-    for i in range(few):
-        data, x, total = problem.only(i), problem.x0[i].copy(), 0.0
-        start = x
-        for _ in range(steps):
-            seconds, u = cpu(lambda i=i, x=x: rival.step(i, x))
-            cost, x = execute(data, x, u[None])
-            total += cost
-            times.append(seconds)
-        problem.x0[i] = start
-        costs.append(total)
-    return {"costs": costs, "seconds": statistics.median(times)}
 
 
 def race(name: str, settings: dict, job: dict) -> dict:

@@ -13,20 +13,18 @@ import numpy as np
 from difflcs_envs.errors import OptionsError
 
 
-def checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
-    """Return a finite float64 array of shape (size,), or raise a ValueError."""
+def checked_array(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> np.ndarray:
+    """Return a finite float64 array of a shape, or raise a ValueError."""
+    expected = f"Expected {name} = {meaning}, finite, shape {shape}"
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"Expected {name} = {meaning}, shape ({size},), got {value!r}. Pass so many.") from error
-    if array.shape != (size,):
-        raise ValueError(
-            f"Expected {name} = {meaning}, shape ({size},), got shape {array.shape}. Pass {size} numbers, unbatched."
-        )
+        raise ValueError(f"{expected}, got {value!r:.200}. Pass numbers.") from error
+    if array.shape != shape:
+        raise ValueError(f"{expected}, got shape {array.shape}. Pass {' x '.join(map(str, shape))} numbers.")
     if not np.isfinite(array).all():
-        raise ValueError(
-            f"Expected {name} = {meaning}, all finite, got {array.tolist()}. Find out where NaN or infinity comes from."
-        )
+        bad = np.argwhere(~np.isfinite(array)).tolist()
+        raise ValueError(f"{expected}, got NaN or infinity at {bad}. Find out where they come from.")
     return array
 
 

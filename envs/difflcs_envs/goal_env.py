@@ -28,6 +28,8 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         model, data: MuJoCo's.
     """
 
+    dt: ClassVar[float]
+    """Duration of one step [s]."""
     action_limit: ClassVar[float]
     action_meaning: ClassVar[str]
     unstable: ClassVar[str]
@@ -85,7 +87,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if self._steps is None:
             raise ResetNeeded("Expected a running episode, but it has ended or never began. Call reset() first.")
         assert self.action_space.shape is not None
-        requested = checked_array("action", action, self.action_space.shape[0], self.action_meaning)
+        requested = checked_array("action", action, self.action_space.shape, self.action_meaning)
         executed = requested.clip(-self.action_limit, self.action_limit)
         before, after = self._state, self._simulate(executed)
         self._state = before.copy() if after is None else after
@@ -115,9 +117,9 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     def _simulate(self, action: np.ndarray) -> np.ndarray | None:
         """Execute an action within the limit; return the state after it, None where the simulation became unstable."""
 
-    @abstractmethod
     def _observation(self) -> dict[str, np.ndarray]:
         """Return what is observed now, in arrays of its own."""
+        return {"state": self._state.copy(), "goal": self._goal.copy()}
 
     def _stepped(self, info: dict[str, Any]) -> None:
         """Do what else belongs to a step, and add to its info."""

@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from difflcs_envs.checks import checked_options
+from difflcs_envs.checks import checked_array, checked_options
 from difflcs_envs.errors import PhysicsWarning
 from difflcs_envs.trifinger.base import UNSTABLE, TriFingerEnv
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
@@ -125,7 +125,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
             ValueError: The actions have the wrong shape or are not finite.
             gymnasium.error.ResetNeeded: There was no reset, or (mode DISABLED) an episode has ended.
         """
-        requested = self._checked_actions(actions)
+        requested = checked_array("actions", actions, (self.num_envs, ACTION_SIZE), ACTION_MEANING)
         if not self._began or (self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any()):
             raise ResetNeeded(
                 "Expected a running episode in every environment, but some have ended or never began. Call reset() "
@@ -214,19 +214,6 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
                 "Pass a NumPy array of bool."
             )
         return mask
-
-    def _checked_actions(self, actions: Any) -> np.ndarray:
-        expected = f"Expected actions = {ACTION_MEANING}, shape ({self.num_envs}, {ACTION_SIZE}), all finite"
-        try:
-            array = np.array(actions, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{expected}, got {actions!r}. Pass one row of numbers per environment.") from error
-        if array.shape != (self.num_envs, ACTION_SIZE):
-            raise ValueError(f"{expected}, got shape {array.shape}. Pass one row per environment.")
-        if not np.isfinite(array).all():
-            bad = np.flatnonzero(~np.isfinite(array).all(axis=1)).tolist()
-            raise ValueError(f"{expected}, got NaN or infinity in the rows {bad}. Find out where they come from.")
-        return array
 
     def _reset_one(self, i: int, seed: int | None, options: dict[str, Any]) -> None:
         env = self.envs[i]

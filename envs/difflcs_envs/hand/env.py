@@ -125,7 +125,7 @@ class HandTurnObjectEnv(GoalEnv):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_SECONDS)}
-    action_limit, action_meaning = ACTION_LIMIT, "targets of the servos from the joints in rad"
+    dt, action_limit, action_meaning = STEP_SECONDS, ACTION_LIMIT, "targets of the servos from the joints in rad"
     unstable = "The simulation became unstable. The episode is truncated."
     task: TurnTask
 
@@ -166,11 +166,6 @@ class HandTurnObjectEnv(GoalEnv):
         self.action_space = box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,))
         self.observation_space = gymnasium.spaces.Dict(goal=box(-goal_high, goal_high), state=box(-high, high))  # pyright: ignore
         self._state, self._goal, self._held = np.zeros(STATE_SIZE), np.zeros(GOAL_SIZE), 0
-
-    @property
-    def dt(self) -> float:
-        """Duration of one step [s]."""
-        return STEP_SECONDS
 
     def describe(self) -> dict[str, Any]:
         """Describe the object, in JSON types, for records of results."""
@@ -225,11 +220,8 @@ class HandTurnObjectEnv(GoalEnv):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_renderer": None}  # OpenGL stays behind
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        return {"goal": self._goal.copy(), "state": self._state.copy()}
-
     def _checked(self, name: str, value: Any, size: int, meaning: str) -> np.ndarray:
-        array, space = checked_array(f"options['{name}']", value, size, meaning), self.observation_space[name]  # pyright: ignore
+        array, space = checked_array(f"options['{name}']", value, (size,), meaning), self.observation_space[name]  # pyright: ignore
         if array not in space:
             raise ValueError(
                 f"Expected options['{name}'] within observation_space['{name}'], got {array.tolist()}. "

@@ -84,7 +84,7 @@ class TriFingerEnv(GoalEnv):
         "render_modes": ["rgb_array", "human"] if has_display() else ["rgb_array"],
         "render_fps": round(1 / CONTROL_PERIOD),
     }
-    action_limit, action_meaning, unstable = ACTION_LIMIT, ACTION_MEANING, UNSTABLE
+    dt, action_limit, action_meaning, unstable = CONTROL_PERIOD, ACTION_LIMIT, ACTION_MEANING, UNSTABLE
     task: MoveTask
 
     def __init__(
@@ -148,11 +148,6 @@ class TriFingerEnv(GoalEnv):
         return other
 
     @property
-    def dt(self) -> float:
-        """Duration of one step [s]."""
-        return CONTROL_PERIOD
-
-    @property
     def model(self) -> Any:
         """The MuJoCo model."""
         return self.physics.model
@@ -171,14 +166,14 @@ class TriFingerEnv(GoalEnv):
         if goal is None:
             self._goal = random_goal
         else:
-            goal = checked_array("options['goal']", goal, GOAL_SIZE, GOAL_MEANING)
+            goal = checked_array("options['goal']", goal, (GOAL_SIZE,), GOAL_MEANING)
             self.task.check_goal(goal)
             self._goal = np.clip(goal, -np.array(self.task.goal_high), self.task.goal_high)
         if state is None:
             pose = self.reset_noise * pose_noise * ((0.0, 0.0, 1.0) if self.object.pinned else 1.0)
             tips = self.physics.tips_from_noise(self.reset_noise * joint_noise, pose)
         else:
-            state = checked_array("options['state']", state, STATE_SIZE, STATE_MEANING)
+            state = checked_array("options['state']", state, (STATE_SIZE,), STATE_MEANING)
             # The margin admits pi that went through float32.
             if abs(state[2]) > math.pi + 1e-6:
                 raise ValueError(
@@ -260,7 +255,7 @@ class TriFingerEnv(GoalEnv):
     # --- helpers ----------------------------------------------------------------------------------
 
     def _observation(self) -> dict[str, np.ndarray]:
-        observation = {"state": self._state.copy(), "goal": self._goal.copy()}
+        observation = super()._observation()
         if self.observe_time:
             left = 0 if self._steps is None else self.horizon - self._steps
             observation["time_to_go"] = np.array([left * CONTROL_PERIOD])

@@ -9,8 +9,9 @@ Jin & Posa (2024) and Bui & Posa (LCS-RL). Every finger has its own frame at its
     joint 2  about +x, LINK_LENGTH below, middle link     (bends the knee)
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -79,104 +80,88 @@ HAND_GROUP = 2  # geoms that hide the table from above; the camera "top" does no
 COLLISION_GROUP = 3  # geoms that collide but are not drawn
 
 
-def tip_height_for(object_height: float) -> float:
-    """Compute the height [m] at which the fingertips push an object of some height [m]."""
-    return min(max(object_height / 2, MIN_TIP_HEIGHT), MAX_TIP_HEIGHT)
+@dataclass(frozen=True, kw_only=True)
+class SceneObject(ABC):
+    """Base of the objects in the scene, which the fingers push.
 
+    Attributes:
+        name: Name of the object.
+        source: Source of its shape: "built_in", "ycb_mesh", "mesh" or "stand_in".
+        mass: Mass [kg].
+        friction: Sliding friction between object and table.
+        pinned: True if it only turns, about a vertical axis through its origin.
+    """
 
-class SceneObject(Protocol):
-    """Interface of the objects in the scene, which the fingers push."""
-
-    @property
-    def name(self) -> str:
-        """Name of the object."""
-        ...
-
-    @property
-    def source(self) -> str:
-        """Source of its shape: "built_in", "ycb_mesh", "mesh" or "stand_in"."""
-        ...
-
-    @property
-    def mass(self) -> float:
-        """Mass [kg]."""
-        ...
+    name: str
+    source: str
+    mass: float
+    friction: float
+    pinned: bool = False
 
     @property
-    def friction(self) -> float:
-        """Sliding friction between object and table."""
-        ...
-
-    @property
-    def pinned(self) -> bool:
-        """True if the object only turns, about a vertical axis through its origin."""
-        ...
-
-    @property
+    @abstractmethod
     def rest_height(self) -> float:
-        """Height [m] of the body origin above the table when the object rests on it."""
-        ...
+        """Height [m] of the centre of mass above the table when the object rests on it."""
+
+    @property
+    @abstractmethod
+    def height(self) -> float:
+        """Height [m] of the top above the table."""
 
     @property
     def tip_height(self) -> float:
         """Height [m] at which the fingertips push."""
-        ...
+        return min(max(self.height / 2, MIN_TIP_HEIGHT), MAX_TIP_HEIGHT)
 
     @property
+    @abstractmethod
     def outline(self) -> np.ndarray:
-        """Points [m] around the object as seen from above, relative to its origin, (K, 2)."""
-        ...
+        """Points [m] around the object as seen from above, relative to its centre of mass, (K, 2)."""
 
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Describe the object in JSON types, for records of results."""
-        ...
 
+    @abstractmethod
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
         """Add the colliding geoms and the mass; `contact` holds the contact keywords for `add_geom`."""
-        ...
 
+    @abstractmethod
     def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
         """Add the transparent copy that marks the goal; `appearance` holds the keywords for `add_geom`."""
-        ...
 
 
-@dataclass(frozen=True)
-class CubeObject:
+@dataclass(frozen=True, kw_only=True)
+class CubeObject(SceneObject):
     """A solid cube.
 
     Attributes:
         half_size: Half of the edge [m].
-        mass: Mass [kg].
-        friction: Sliding friction between cube and table.
-        pinned: True if it only turns, about a vertical axis through its centre.
-        name: Name of the object.
-        source: Source of its shape.
     """
 
     half_size: float = 0.03
     mass: float = 0.01
     friction: float = 0.5
-    pinned: bool = False
     name: str = "cube"
     source: str = "built_in"
 
     @property
     def rest_height(self) -> float:
-        """Height [m] of the centre above the table."""
+        """See `SceneObject`."""
         return self.half_size
 
     @property
-    def tip_height(self) -> float:
-        """Height [m] at which the fingertips push."""
-        return tip_height_for(2 * self.half_size)
+    def height(self) -> float:
+        """See `SceneObject`."""
+        return 2 * self.half_size
 
     @property
     def outline(self) -> np.ndarray:
-        """Corners [m] as seen from above, (4, 2)."""
+        """See `SceneObject`: the corners, (4, 2)."""
         return self.half_size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 
     def describe(self) -> dict[str, Any]:
-        """Describe the object, for records of results."""
+        """See `SceneObject`."""
         return {
             "name": self.name,
             "source": self.source,
@@ -187,7 +172,7 @@ class CubeObject:
         }
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
-        """Add the cube to the body of the object."""
+        """See `SceneObject`."""
         body.add_geom(
             name="object",
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -198,7 +183,7 @@ class CubeObject:
         )
 
     def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
-        """Add the transparent cube to the body of the goal."""
+        """See `SceneObject`."""
         # A hair larger than the cube: faces in one plane would flicker.
         size = self.half_size + GOAL_MARGIN
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[size] * 3, **appearance)

@@ -15,7 +15,7 @@ import numpy as np
 from difflcs_envs.assets import YCB_DIR_VARIABLE, find_ycb_mesh
 from difflcs_envs.errors import MeshError
 from difflcs_envs.trifinger.meshes import LYING, Solid, check_extent, load_mesh, make_solid
-from difflcs_envs.trifinger.model import COLLISION_GROUP, GOAL_MARGIN, tip_height_for
+from difflcs_envs.trifinger.model import COLLISION_GROUP, GOAL_MARGIN, SceneObject
 from difflcs_envs.ycb import YCB, YcbObject
 
 DEFAULT_MASS = 0.05  # [kg] of YCB objects and meshes. The paper gives none; a tip pushes with 0.45 N at osc_kp 1000.
@@ -30,48 +30,33 @@ COLORS = {
 OTHER_COLOR = (0.55, 0.72, 0.50, 1.0)
 
 
-@dataclass(frozen=True)
-class MeshObject:
+@dataclass(frozen=True, kw_only=True)
+class MeshObject(SceneObject):
     """An object with the shape of a mesh.
 
     Attributes:
-        name: Name of the object.
-        source: "ycb_mesh" or "mesh".
         solid: Its shape in its rest pose.
-        mass: Mass [kg].
-        friction: Sliding friction between object and table.
-        pinned: True if it only turns, about a vertical axis through its origin.
     """
 
-    name: str
-    source: str
     solid: Solid
-    mass: float
-    friction: float
-    pinned: bool = False
 
     @property
     def rest_height(self) -> float:
-        """Height [m] of the centre of mass above the table."""
+        """See `SceneObject`."""
         return self.solid.rest_height
 
     @property
     def height(self) -> float:
-        """Height [m] of the top above the table."""
+        """See `SceneObject`."""
         return float(self.solid.vertices[:, 2].max()) + self.solid.rest_height
 
     @property
-    def tip_height(self) -> float:
-        """Height [m] at which the fingertips push."""
-        return tip_height_for(self.height)
-
-    @property
     def outline(self) -> np.ndarray:
-        """Points [m] around the object as seen from above, (K, 2)."""
+        """See `SceneObject`."""
         return np.concatenate(self.solid.parts)[:, :2]
 
     def describe(self) -> dict[str, Any]:
-        """Describe the object, for records of results."""
+        """See `SceneObject`."""
         return {
             "name": self.name,
             "source": self.source,
@@ -98,7 +83,7 @@ class MeshObject:
         self._add_visual(spec, body, "object_visual", 1.0, {"rgba": COLORS.get(self.name, OTHER_COLOR)})
 
     def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
-        """Add the transparent copy of the mesh."""
+        """See `SceneObject`."""
         # A hair larger than the object: faces in one place would flicker.
         scale = 1.0 + GOAL_MARGIN / float(self.solid.size.max() / 2)
         self._add_visual(spec, body, "goal_visual", scale, appearance)
@@ -116,8 +101,8 @@ class MeshObject:
         )
 
 
-@dataclass(frozen=True)
-class StandInObject:
+@dataclass(frozen=True, kw_only=True)
+class StandInObject(SceneObject):
     """Boxes, cylinders and capsules in place of a YCB object whose mesh is not on this machine.
 
     Size, mass and resting height are those of the object, the rest is rough: results with it are not results with the
@@ -125,41 +110,24 @@ class StandInObject:
 
     Attributes:
         ycb: The object it stands in for.
-        mass: Mass [kg].
-        friction: Sliding friction between object and table.
-        source: "stand_in".
-        pinned: True if it only turns, about a vertical axis through its origin.
     """
 
     ycb: YcbObject
-    mass: float
-    friction: float
     source: str = "stand_in"
-    pinned: bool = False
-
-    @property
-    def name(self) -> str:
-        """Name of the object."""
-        return self.ycb.name
 
     @property
     def rest_height(self) -> float:
-        """Height [m] of the centre of mass above the table."""
+        """See `SceneObject`."""
         return self.ycb.rest_height
 
     @property
     def height(self) -> float:
-        """Height [m] of the top above the table."""
+        """See `SceneObject`."""
         return self.ycb.size[2]
 
     @property
-    def tip_height(self) -> float:
-        """Height [m] at which the fingertips push."""
-        return tip_height_for(self.height)
-
-    @property
     def outline(self) -> np.ndarray:
-        """Points [m] around the object as seen from above, (K, 2)."""
+        """See `SceneObject`."""
         return np.concatenate(self.outlines)
 
     @property
@@ -174,7 +142,7 @@ class StandInObject:
         return volumes @ np.array([p.center[:2] for p in self.ycb.stand_in]) / volumes.sum()
 
     def describe(self) -> dict[str, Any]:
-        """Describe the object, for records of results."""
+        """See `SceneObject`."""
         return {
             "name": self.name,
             "source": self.source,
@@ -185,14 +153,14 @@ class StandInObject:
         }
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
-        """Add the primitives to the body of the object."""
+        """See `SceneObject`."""
         origin = np.array([*self._middle, self.rest_height])
         volume = sum(p.volume for p in self.ycb.stand_in)
         _set_inertia(body, self.mass, np.sum([p.inertia(origin) for p in self.ycb.stand_in], axis=0) / volume)
         self._add(body, 0.0, {"mass": 0.0, "rgba": COLORS.get(self.name, OTHER_COLOR), **contact}, name="object")
 
     def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
-        """Add the transparent copy to the body of the goal."""
+        """See `SceneObject`."""
         self._add(body, GOAL_MARGIN, appearance)
 
     def _add(self, body: mujoco.MjsBody, margin: float, keywords: dict[str, Any], name: str = "") -> None:
@@ -254,7 +222,7 @@ def make_object(
         mesh = load_mesh(path, mesh_scale)
         check_extent(mesh, name, entry.size, path)
         solid = make_solid(mesh, name, entry.parts if parts is None else parts, rest_pose, entry.concavity)
-        return MeshObject(name, "ycb_mesh", solid, kilograms, friction)
+        return MeshObject(name=name, source="ycb_mesh", solid=solid, mass=kilograms, friction=friction)
     if source == "mesh":
         raise MeshError(
             f"Expected the YCB mesh of {name}, found none. Get it with 'difflcs assets download {name}', let "
@@ -265,7 +233,7 @@ def make_object(
             f"Expected rest_pose 'lying' for the stand-in of {name}, got {rest_pose!r}. Other poses need the mesh: "
             f"difflcs assets download {name}"
         )
-    return StandInObject(entry, kilograms, friction)
+    return StandInObject(name=name, ycb=entry, mass=kilograms, friction=friction)
 
 
 def _object_from_file(
@@ -287,7 +255,7 @@ def _object_from_file(
             "Expected object_source 'auto' or 'mesh' for a mesh file, got 'stand_in'. Only YCB objects have one."
         )
     solid = make_solid(load_mesh(path, mesh_scale), path.name, parts, rest_pose)
-    return MeshObject(path.stem, "mesh", solid, _mass(mass, None), friction)
+    return MeshObject(name=path.stem, source="mesh", solid=solid, mass=_mass(mass, None), friction=friction)
 
 
 def _mass(mass: float | str | None, published: float | None) -> float:
