@@ -11,6 +11,9 @@ Our policy is a contact MPC: a quasi-dynamic system and a cost in task space, bo
 ten times a second. Its plan at several paces, what is left of the last way, and a few variations of the best of these
 are rehearsed for half a second in the model with which Judo plans, in steps of 5 ms; the best one is begun. No data.
 
+With `--spin 1` or `--spin -1` the goal runs ahead of the cube about the vertical: where less than 0.8 rad are left, it
+goes on by 0.4 rad, which counts as a goal. The seed says where it begins.
+
 Times are CPU times. With `--out FILE` episodes that are in the file are not played again.
 """
 
@@ -42,6 +45,7 @@ from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
 from difflcs.status import solved
 
+STEP = 0.4  # by which the goal of a spin runs on [rad]
 FINGERS = {"if": "bs px md ds", "mf": "bs px md ds", "rf": "bs px md ds", "th": "mp bs px ds"}
 
 
@@ -100,6 +104,8 @@ class Options:
     """Rollouts of Judo's planner; None: its default."""
     rate: float | None = None
     """Decisions a second of Judo's planner; None: its default."""
+    spin: Literal[-1, 0, 1] = 0
+    """Not 0: the cube is to be turned about the vertical all the time, this way."""
     judo: Path | None = None
     """Folder in which Judo is installed, if it is not in this environment."""
     out: Path | None = None
@@ -125,8 +131,9 @@ def load_judo(folder: Path | None) -> Any:
 class Episode:
     """Judo's simulation, with goals that depend on the seed alone, and counts of goals and drops."""
 
-    def __init__(self, make_task: Any, seed: int):
+    def __init__(self, make_task: Any, seed: int, spin: int = 0):
         self.goals, self.drops, self.random = -1, -1, np.random.RandomState(seed).get_state()
+        self.spin, self.first = spin, STEP * (2 + np.random.RandomState(seed).rand())
         self.task = make_task()
         self.draw, self.lay = self.task._update_goal_quat, self.task.reset
         self.task._update_goal_quat, self.task.reset = self.next_goal, self.reset
@@ -135,15 +142,21 @@ class Episode:
 
     def next_goal(self) -> None:
         """Draw the next goal; Judo draws from NumPy's one generator, which its planners use, too."""
+        self.goals += 1
+        if self.spin:
+            self.ahead += STEP * self.spin
+            goal = np.array([np.cos(self.ahead / 2), 0.0, 0.0, np.sin(self.ahead / 2)])
+            self.task.data.mocap_quat[0] = self.task.goal_quat = goal
+            return
         others = np.random.get_state()  # noqa: NPY002
         np.random.set_state(self.random)  # noqa: NPY002
         self.draw()
         self.random = np.random.get_state()  # noqa: NPY002
         np.random.set_state(others)  # noqa: NPY002
-        self.goals += 1
 
     def reset(self) -> None:
         """Lay the cube into the hand, with another goal that was not reached."""
+        self.ahead = (self.first - STEP) * self.spin
         self.lay()
         self.goals, self.drops = self.goals - 1, self.drops + 1
 
@@ -152,6 +165,8 @@ class Episode:
         self.task.data.ctrl[:] = ctrl
         mujoco.mj_step(self.task.sim_model, self.task.data)
         self.task.post_sim_step()
+        if self.spin and 2 * np.arccos(min(1.0, abs(float(self.task.data.qpos[3:7] @ self.task.goal_quat)))) < 2 * STEP:
+            self.next_goal()
 
 
 class HandPolicy:
@@ -327,7 +342,7 @@ class Judo:
 def play(make_task: Any, o: Options, seed: int) -> dict[str, Any]:
     """Play an episode."""
     np.random.seed(seed)  # noqa: NPY002 (Judo draws from there)
-    episode = Episode(make_task, seed)
+    episode = Episode(make_task, seed, o.spin)
     policy = (Ours if o.policy == "ours" else Judo)(episode.task, o)
     policy.control(episode.task)  # what happens once, such as imports, is not counted
     policy.due, used, reached = 0.0, 0.0, []
@@ -343,6 +358,7 @@ def play(make_task: Any, o: Options, seed: int) -> dict[str, Any]:
         "policy": o.policy,
         "rollouts": o.rollouts,
         "rate": o.rate,
+        "spin": o.spin,
         "seed": seed,
         "seconds": o.seconds,
         "goals": episode.goals,
@@ -360,7 +376,7 @@ def main(o: Options) -> None:
     rows: list[dict[str, Any]] = []
     out = o.out
     lines = out.read_text().splitlines() if out is not None and out.exists() else []
-    same = {"policy": o.policy, "rollouts": o.rollouts, "rate": o.rate, "seconds": o.seconds}
+    same = {"policy": o.policy, "rollouts": o.rollouts, "rate": o.rate, "seconds": o.seconds, "spin": o.spin}
     known = {row["seed"]: row for row in map(json.loads, lines) if same.items() <= row.items()}
     for seed in range(o.seed, o.seed + o.episodes):
         if seed not in known:
@@ -375,6 +391,7 @@ def main(o: Options) -> None:
     print(
         f"{o.policy}: {goals / minutes:.2f} goals and {drops / minutes:.2f} drops a minute, "
         f"{used / minutes / 60:.3f} s of CPU a second of the robot, {60 * goals / used:.2f} goals a minute of CPU"
+        + (f", {STEP * goals / minutes / 60:.2f} rad/s" if o.spin else "")
     )
 
 
