@@ -13,7 +13,7 @@ import pytest
 
 import difflcs_envs
 from difflcs_envs.hand.env import HandTurnObjectEnv
-from difflcs_envs.rendering import SceneRenderer
+from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend
 from difflcs_envs.trifinger import kinematics
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv
 from difflcs_envs.trifinger.model import FINGER_YAWS
@@ -283,6 +283,25 @@ def test_render_without_mode_warns():
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render mode"):
         assert env.render() is None
+
+
+@pytest.mark.skipif(has_display(), reason="this machine has a display")
+def test_human_mode_without_display_is_refused():
+    assert "human" not in TriFingerMoveCubeEnv.metadata["render_modes"]
+    with pytest.raises(difflcs_envs.RenderingError, match="rgb_array"):
+        make(render_mode="human")
+
+
+def test_the_users_choice_of_opengl_is_kept(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert select_gl_backend() == "osmesa"
+    monkeypatch.delenv("MUJOCO_GL")
+    own = select_gl_backend()
+    monkeypatch.setenv("MUJOCO_GL", "")
+    assert select_gl_backend() == own
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with pytest.raises(difflcs_envs.RenderingError, match=r"MUJOCO_GL: expected egl.*got 'nonsense'; change"):
+        select_gl_backend()
 
 
 def test_broken_opengl_names_the_packages(monkeypatch):

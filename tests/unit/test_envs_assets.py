@@ -1,8 +1,11 @@
 """Downloading the YCB meshes, from a server on this machine."""
 
+import contextlib
+import gzip
 import http.server
 import io
 import json
+import random
 import subprocess
 import sys
 import tarfile
@@ -24,12 +27,13 @@ def box_stl(size=(0.176, 0.092, 0.045)) -> bytes:
     return trimesh.creation.box(size).export(file_type="stl")
 
 
-def archive(files) -> bytes:
+def archive(files, kind=tarfile.REGTYPE) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for name, content in files.items():
             member = tarfile.TarInfo(name)
-            member.size = len(content)
+            member.size, member.type = len(content), kind
+            member.linkname = "/etc/passwd" if kind == tarfile.SYMTYPE else ""
             tar.addfile(member, io.BytesIO(content))
     return buffer.getvalue()
 
@@ -40,10 +44,14 @@ class Server(http.server.BaseHTTPRequestHandler):
     content = b""
     cuts: tuple[int, ...] = ()  # bytes after which the next connections break off
     requests = 0
+    raw = None  # an answer that is sent as it is
 
     def do_GET(self):
         cls = type(self)
         cls.requests += 1
+        if cls.raw is not None:
+            self.wfile.write(cls.raw)
+            return
         self.send_response(200)
         self.send_header("Content-Length", str(len(cls.content)))
         self.end_headers()
@@ -112,7 +120,9 @@ def test_changed_archive_is_refused(server, tmp_path, monkeypatch):
     ("content", "message"),
     [
         (archive({"../evil.txt": b"x"}), "OutsideDestinationError"),
+        (archive({MESH: b""}, tarfile.SYMTYPE), "AbsoluteLinkError"),
         (archive({"004_sugar_box/readme.txt": b"x"}), "found no such mesh"),
+        (archive({"004_sugar_box.stl": box_stl()}), "found no such mesh"),
         (archive({MESH: b"solid"}), "is not used"),
         (archive({MESH: box_stl((0.3, 0.1, 0.1))}), r"expected.*45 x 92 x 176 mm.*got 100 x 100 x 300 mm|Expected"),
         (b"not an archive", "is not used"),
@@ -158,11 +168,21 @@ def test_an_object_that_is_unknown_and_an_address_that_is_no_pattern(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("url", ["http://127.0.0.1:9/{code}", "nonsense", "file:///none"])
-def test_an_address_that_leads_nowhere(tmp_path, monkeypatch, url):
+NOWHERE = {
+    **dict.fromkeys(["http://127.0.0.1:9/{code}", "nonsense", "http://[/x", "file:///none"], b""),
+    "server: missing": b"HTTP/1.1 404 Not Found\r\n\r\n",
+    "server: elsewhere": b"HTTP/1.1 302 Found\r\nLocation: http://[\r\n\r\n",
+    "server: no number": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    "server: nothing": b"",
+}
+
+
+@pytest.mark.parametrize("url", NOWHERE)
+def test_an_address_that_leads_nowhere(server, tmp_path, monkeypatch, url):
     monkeypatch.setattr(assets, "ATTEMPTS", 1)
-    with pytest.raises(AssetError, match="Check the network"):
-        assets.download(["sugar_box"], tmp_path, url)
+    server.raw = NOWHERE[url]
+    with pytest.raises(AssetError, match="404.*Check the network" if "missing" in url else "Check the network"):
+        assets.download(["sugar_box"], tmp_path, server.url if "server" in url else url)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -175,6 +195,20 @@ def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
     with pytest.raises(AssetError, match="at most 1 MB unpacked"):
         fetch(server, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_archives(server, tmp_path):
+    """Damage by a seeded generator, of the compressed stream and of the tar inside it: an error of ours, or a mesh."""
+    rng = random.Random(0)
+    whole = archive({MESH: box_stl(), "004_sugar_box/readme.txt": b"x" * 600})
+    for i in range(60):
+        data = bytearray(whole if i % 2 else gzip.decompress(whole))
+        for _ in range(rng.choice((1, 3, 30))):
+            data[rng.randrange(min(len(data), rng.choice((512, 10_000))))] = rng.randrange(256)
+        server.content = bytes(data) if i % 2 else gzip.compress(bytes(data), 1)
+        with contextlib.suppress(AssetError):
+            fetch(server, tmp_path / str(i))
+        assert not list((tmp_path / str(i)).glob(".*"))
 
 
 @pytest.mark.parametrize(
@@ -200,6 +234,28 @@ def test_a_folder_that_cannot_be_written(server, tmp_path):
 
 
 # --- several processes: how they wait is in test_envs_objects.py ------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_processes_lose_nothing(server, tmp_path):
+    """Three at a time, two of which download the same object."""
+    names, answer = ("sugar_box", "fish_can", "sugar_box"), server.do_GET
+    boxes = {YCB[n].code: archive({f"{YCB[n].code}/google_16k/nontextured.stl": box_stl(YCB[n].size)}) for n in names}
+
+    def do_get(self):
+        type(self).content = boxes[self.path[1:].removesuffix(".tgz")]
+        time.sleep(0.2)
+        answer(self)
+
+    server.do_GET = do_get
+    program = "import pathlib, sys; from difflcs_envs import assets; name, folder, url = sys.argv[1:]\n"
+    command = [sys.executable, "-c", f"{program}assets.download([name], pathlib.Path(folder), url)"]
+    running = [subprocess.Popen([*command, name, str(tmp_path), server.url]) for name in names]
+    assert [process.wait(120) for process in running] == [0] * 3
+    assert server.requests == 2  # the one that waited has found the archive
+    archives = {f"{code}_google_16k.tgz" for code in boxes}
+    assert {*json.loads((tmp_path / "sha256.json").read_text())} == archives
+    assert {path.name for path in tmp_path.iterdir()} == {*boxes, *archives, "sha256.json"}
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The tables that Python and the kernels share: fields of a problem, and how a solve can end."""
 
 import dataclasses
+import re
 import runpy
 from pathlib import Path
 
@@ -39,3 +40,12 @@ def test_the_system_is_the_same_everywhere():
 def test_the_codes_are_those_of_the_kernels():
     assert {s.name: int(s) for s in Status} == _kernels.status_codes()
     assert all(s.advice for s in Status)
+
+
+def test_codes_and_tolerances_of_the_kernels_have_their_numbers_in_no_other_file():
+    code = re.compile(r"\b(CONVERGED|MAX_ITER|INFEASIBLE|NUMERICAL|DEGENERATE|converged|infeasible)\b\s*[=:]\s*\d")
+    tolerance = re.compile(rf"^_?({'|'.join(name.upper() for name in _kernels.tolerances())}) = [\d.]", re.MULTILINE)
+    for path in (path for kind in ("py", "cpp", "hpp") for path in SOURCE.rglob(f"*.{kind}")):
+        assert not code.search(path.read_text()), path.name
+    for path in [*SOURCE.glob("*.py"), *(SOURCE / "mpc").rglob("*.py")]:
+        assert not tolerance.search(path.read_text()), path.name
