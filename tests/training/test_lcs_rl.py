@@ -1,7 +1,5 @@
 """LCS-RL: the warm-up and the main phase as one trainer, on a small pushing system that needs no simulator."""
 
-import torch
-
 from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.policy import make_actor
@@ -93,13 +91,3 @@ def test_the_main_phase_remembers_the_warm_up():
     assert len(trainer.current.models) == 8
     trainer.step()
     assert len(trainer.current.models) == 8 + ROLLOUTS
-
-
-def test_the_newest_episodes_of_the_warm_up_are_those_of_the_start():
-    trainer = make_lcsrl(models=True, gain=-1.65)
-    for _ in range(3):
-        trainer.step()
-    seen = trainer.current.models.episodes
-    cost = 20 * (seen["state"][:, :-1] - seen["goal"].unsqueeze(1)).abs().squeeze(-1).clamp_max(3 / 20)
-    failed = (seen["state"][:, -1] - seen["goal"]).abs().squeeze(-1) >= 0.05
-    torch.testing.assert_close(trainer.current.incumbent.episodes[0][1], -0.1 * (cost.sum(1) + PENALTY * failed))

@@ -2,9 +2,10 @@
 
 Many steps of PPO make a good policy worse until later ones mend it. So PPO goes on learning as it does, and its policy
 is handed out only if a one-sided test allows it, on the returns of its newest episodes and those of the best policy so
-far. A start that works already is replaced by nothing but what is certainly better. A poor one that PPO makes better in
-many small steps, none of them certain in few episodes, is replaced unless the new one is certainly worse; it is always
-compared with the best, so that many small losses are seen. The test has two additions:
+far, all played with the same noise. A start that works already plays first, and is replaced by nothing but what is
+certainly better. A poor one is replaced by the first policy that PPO plays. PPO makes that better in many small steps,
+none of them certain in few episodes, so it is replaced unless the new one is certainly worse; it is always compared
+with the best, so that many small losses are seen. The test has two additions:
 
 - Episodes differ most by their goals. What the value network expects of a start is subtracted from its return.
 - A policy that fails in 3 % of its episodes fails in none of thirty as often as not. So the test counts one failed
@@ -21,8 +22,6 @@ from torch import Tensor
 
 from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.state_tree import State, copy_state
-from difflcs.rl.learning.surrogate import gaussian_kl, trimmed_mean
-from difflcs.rl.rollout import CONTEXT
 
 if TYPE_CHECKING:
     from difflcs.rl.learning.policy import GaussianPolicy
@@ -71,12 +70,17 @@ class Incumbent:
         """Of the best, then of the learner's newest iterations since it was found: inputs of the value network at the
         starts (N, n_inputs), returns (N,)."""
 
+    @property
+    def keeps_start(self) -> bool:
+        """True if nothing but what is certainly better replaces the start."""
+        return self.errors >= 0
+
     def begin(self) -> None:
         """Remember the learner as it is: it plays now."""
         self._playing = copy_state(self.learner.state_dict())
 
     def challenge(self, starts: Tensor, returns: Tensor, values: Callable[[Tensor], Tensor]) -> bool:
-        """Let the model that has played take its place if the test allows it. The first episodes are its own.
+        """Let the model that has played take its place if the test allows it. The first one is not tested.
 
         Args:
             starts: (N, n_inputs) inputs of the value network at the start of its episodes.
@@ -87,6 +91,9 @@ class Incumbent:
             True if the model took its place.
         """
         self.episodes.append((starts, returns))
+        if len(self.episodes) == 1 and not self.keeps_start:
+            self.learned.load_state_dict(self._playing)
+            return True
         del self.episodes[1:-ITERATIONS]
         gains = [outcome - values(start) for start, outcome in self.episodes]
         for count in range(1, len(self.episodes)):
@@ -117,11 +124,3 @@ class Incumbent:
     def _join(self, parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         starts, returns = zip(self._none, *parts, strict=True)
         return torch.cat(starts), torch.cat(returns)
-
-
-def distance(actor: GaussianPolicy, episodes: Any) -> float:
-    """Compute the KL divergence of a policy from the one that played episodes, in their states."""
-    old = episodes["policy"].flatten(0, 1)
-    with torch.no_grad():
-        new: Any = actor.solve(old.select(*actor.in_keys, CONTEXT, strict=False))
-        return trimmed_mean(gaussian_kl(old, new))

@@ -21,7 +21,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
 from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic
-from difflcs.rl.learning.incumbent import Incumbent, distance
+from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.state_tree import State
@@ -29,7 +29,7 @@ from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
 from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
-from difflcs.rl.tasks import Features, Outcome, compute_features
+from difflcs.rl.tasks import Features, compute_features
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -193,24 +193,16 @@ class PPO(Trainer):
         return self.iteration - self.first_iteration >= len(self.sizes)
 
     def remember(self, episodes: TensorDict) -> None:
-        """Add earlier real episodes, such as those of a warm-up, to the data of the model rollouts.
-
-        The newest ones tell how good the start is, unless nothing but what is certainly better may replace it.
-        """
-        if self.models is None:
-            return
-        self.models.add(episodes)
-        if self.incumbent is not None and self.incumbent.errors < 0:
-            newest = episodes[-self.sizes[0] :]
-            rewards = self.scale(*_judge(self.models.env.outcome, newest))
-            self.incumbent.challenge(_inputs(self.features, newest)[:, 0], rewards.sum(1), self.critic.values)
+        """Add earlier real episodes, such as those of a warm-up, to the data of the model rollouts."""
+        if self.models is not None:
+            self.models.add(episodes)
 
     def step(self, after_step: AfterStep | None = None) -> PPOReport:
         """One iteration: collect, estimate advantages, improve the policy, fit the value network.
 
         Iterations on model rollouts come first, if there are models with real episodes. More of them follow the last
-        real episodes where the settings say so. The robot does not try what they teach, so it is handed out only where
-        `max_kl` bounds how far it is from what was tried and accepted, in the states of the newest episodes.
+        real episodes where the settings say so. The robot does not try what they teach, so it is handed out only after
+        a policy that was accepted, and where the start need not be kept.
 
         Raises:
             InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
@@ -243,7 +235,7 @@ class PPO(Trainer):
             start = time.perf_counter()
             for k in range(self.models.settings.last):
                 model_success, model_loss = self._train_on_models(scale, 1 + k * self.models.settings.iterations)
-            if kept is not None and accepted and distance(self.actor, episodes[episodes["stable"]]) <= self.max_kl:
+            if kept is not None and accepted and not kept.keeps_start:
                 kept.learned.load_state_dict(kept.learner.state_dict())
             model_seconds += time.perf_counter() - start
         return PPOReport(
@@ -277,7 +269,8 @@ class PPO(Trainer):
         Iterations are numbered from `first`. Both are None if there are no models, or no real episodes in them yet.
         """
         models = self.models
-        unknown = self.incumbent is not None and not self.incumbent.episodes
+        kept = self.incumbent
+        unknown = kept is not None and kept.keeps_start and not kept.episodes
         if unknown or models is None or self.practice is None or not (len(models) and models.settings.iterations):
             return None, None
         settings = models.settings
@@ -452,15 +445,6 @@ def _inputs(features: Features, episodes: TensorDict) -> Tensor:
     context = episodes.get(CONTEXT, None)
     context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
     return compute_features(features, states, goals, elapsed, context)
-
-
-def _judge(outcome: Outcome, episodes: Any) -> tuple[Tensor, Tensor]:
-    """(N, T) rewards and (N,) successes of episodes that are known without them."""
-    states, actions = episodes["state"], episodes["action"]
-    goals = episodes["goal"].unsqueeze(1).expand(-1, actions.shape[1], -1)
-    ended = torch.arange(1, actions.shape[1] + 1) == actions.shape[1]
-    rewards, successes = outcome(states[:, :-1], actions, states[:, 1:], goals, ended)
-    return rewards, successes[:, -1]
 
 
 def _step_data(actor: GaussianPolicy, policy: Any) -> TensorDict:
