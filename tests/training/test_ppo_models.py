@@ -51,7 +51,7 @@ def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
 
 
 def test_real_episodes_are_tested_once():
-    trainer, sizes = make_practising(models={"iterations": 1, "steps": 1}, steps=1, gain=-1.65), []
+    trainer, sizes = make_practising(models={"iterations": 1, "steps": 1}, steps=1, gain=-3.0), []
     challenge = trainer.incumbent.challenge
     trainer.incumbent.challenge = lambda starts, *rest: sizes.append(len(starts)) or challenge(starts, *rest)
     for _ in range(2):

@@ -90,3 +90,20 @@ def test_unless_it_is_worse_a_policy_passes_but_many_small_losses_do_not():
     assert accepted[0]  # there is nothing to compare it with
     assert any(accepted[1:])
     assert not any(accepted[6:])
+
+
+def test_the_last_of_several_equal_policies_is_seldom_refused():
+    """It is compared with the luckiest one, so that -1.65 refuses far more than the 5 % of a single comparison."""
+
+    def refused(errors):
+        count, starts = 0, torch.zeros(15, 1, dtype=F64)
+        for seed in range(100):
+            incumbent, passed = make(0.0, errors), []
+            for k in range(6):
+                incumbent.begin()
+                passed.append(incumbent.challenge(starts, drawn(10 * seed + k, 15), lambda inputs: inputs.squeeze(-1)))
+            count += not passed[-1]
+        return count
+
+    assert refused(-3.0) <= 3
+    assert refused(-1.65) > 10

@@ -78,7 +78,7 @@ class PPOSettings(Settings):
     """Factor on all rewards: keeps values near one."""
     critic: CriticSettings = group(CriticSettings)
     """Settings of the value network."""
-    gain: float | None = bounded(-1.65, minimum=-100, maximum=100)
+    gain: float | None = bounded(-3.0, minimum=-100, maximum=100)
     """Standard errors by which the newest real returns must exceed those of the best policy so far, for a policy to be
     handed out; below 0: unless they fall short by more. None: the newest always is, as in the paper."""
 
