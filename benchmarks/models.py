@@ -76,10 +76,6 @@ def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Instance
     return make(lcs, pushing_cost(), horizon, ACTION_LIMIT, *states_and_goals(count, seed))
 
 
-def _zoo(name: str) -> LCSParams:
-    return LCSModel.from_pretrained(f"zoo:trifinger-{name}").params().detach()
-
-
 def to_rest(lcs: LCSParams, horizon: int, count: int, seed: int, final: float = 1.0) -> Instance:
     """Bring any model to rest; `final` is the weight of its last state."""
     eye = torch.eye(lcs.n_x, dtype=torch.float64)
@@ -113,7 +109,10 @@ OBJECTS = ("cube", "mug", "wrench", "banana")
 FAMILIES: dict[str, Callable[[int], list[Instance]]] = {
     "pushing, n_lam 5": lambda count: [pushing(pushing_model(5, seed), count, seed) for seed in range(4)],
     "pushing, n_lam 8": lambda count: [pushing(pushing_model(8, seed), count, seed) for seed in range(4)],
-    "zoo": lambda count: [pushing(_zoo(name), count, 10 + i) for i, name in enumerate(OBJECTS)],
+    "zoo": lambda count: [
+        pushing(LCSModel.from_pretrained(f"zoo:trifinger-{name}").params().detach(), count, 10 + i)
+        for i, name in enumerate(OBJECTS)
+    ],
     "random, n_lam 5, H 10": lambda count: [to_rest(random_model(5, seed), 10, count, seed, 10.0) for seed in range(4)],
     "cart-pole, H 30": lambda count: [_cart_pole(30, 0.04, stiffness, count) for stiffness in (10.0, 100.0)],
     "cart-pole, H 50": lambda count: [_cart_pole(50, 0.02, stiffness, count) for stiffness in (10.0, 100.0)],

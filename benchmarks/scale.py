@@ -52,16 +52,6 @@ class Options:
     """Everything tiny."""
 
 
-def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> Instance:
-    """Make a random model, to be brought to rest."""
-    return to_rest(random_model(n_lam, seed, n_x, n_u=2 * n_x // 3), horizon, count, seed)
-
-
-def carts_problem(carts: int, horizon: int, count: int) -> Instance:
-    """Make a chain of carts whose middle ones have a price, too."""
-    return chain(chain_of_carts(carts, dt=0.1), horizon, count, carts, others=0.1)
-
-
 @torch.no_grad()
 def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]:
     """Solve problems of one size by one backend, print a line, and give the figures; times are seconds of CPU."""
@@ -95,10 +85,13 @@ def main(o: Options) -> None:
     if o.smoke:
         o.problems, o.seeds, random, carts, horizons, models, few = 4, 1, random[:1], carts[:1], horizons[:1], 2, 2
     rows = []
-    for size in random:
-        instances = [random_problem(*size, o.problems, seed) for seed in range(o.seeds)]
+    for n_x, n_lam, horizon in random:
+        systems = [random_model(n_lam, seed, n_x, n_u=2 * n_x // 3) for seed in range(o.seeds)]
+        instances = [to_rest(system, horizon, o.problems, seed) for seed, system in enumerate(systems)]
         rows.append(measure("random", "batched", instances))
-    rows += [measure("carts", "batched", [carts_problem(*size, o.problems * o.seeds)]) for size in carts]
+    for count, horizon in carts:  # whose middle ones have a price, too
+        whole = chain(chain_of_carts(count, dt=0.1), horizon, o.problems * o.seeds, count, others=0.1)
+        rows.append(measure("carts", "batched", [whole]))
     make: Callable[[int, int], Any]
     for family, make in WEAK.items():
         for horizon in horizons:

@@ -85,15 +85,6 @@ def pairs_of(cells: Cells, recipe: str) -> report.Pairs:
     return {label: pair for label, pair in pairs.items() if report.paired(*pair, EARLY)}
 
 
-def words(pairs: report.Pairs, recipe: str) -> list[str]:
-    """Describe the differences by their intervals."""
-    said = []
-    for label, when in APART.items():
-        apart = {name: report.paired_estimate(*pair, when) for name, pair in pairs.items()}
-        said.append(f"LCS-RL, {RECIPES[recipe].label}, {label}: {report.verdict(apart, 'than', 'from')}.")
-    return said
-
-
 def lowest(cells: Cells, recipe: str) -> list[str]:
     """Describe LCS-RL's worst seed, which an interval of the mean does not show."""
     cell = cells[SIDES[recipe][0]]
@@ -140,9 +131,11 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     tables, said = {"Success on the cube, mean over the seeds [%]": table(cells)}, []
     for recipe in SIDES:
         if pairs := pairs_of(cells, recipe):
-            title = f"LCS-RL on the cube, {RECIPES[recipe].label}, beside the others: differences paired by seed"
+            label = RECIPES[recipe].label
+            title = f"LCS-RL on the cube, {label}, beside the others: differences paired by seed"
             tables[title] = report.differences("LCS-RL −", pairs, APART)
-            said += words(pairs, recipe)
+            found = report.verdicts(pairs, APART, "than", "from")
+            said += [f"LCS-RL, {label}, {time}: {verdict}." for time, verdict in found.items()]
         said += lowest(cells, recipe)
     notes = [NOTE, reached(cells), *report.bullets(said), *report.provenance(list(cells.values()))]
     report.write_tables(folder, name, tables, notes, {name: "Success against minutes of data"})

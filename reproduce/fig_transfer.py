@@ -38,15 +38,6 @@ def pairs_of(cells: Cells) -> report.Pairs:
     return {task.replace("_", " "): (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
 
 
-def words(pairs: report.Pairs, label: str) -> list[str]:
-    """Describe the differences at each time, and whether PPO's first minutes undo what transfer has gained."""
-    said = []
-    for time, when in WHEN.items():
-        apart = {task: report.paired_estimate(*pair, when) for task, pair in pairs.items()}
-        said.append(f"From the cube's model against from scratch, {label}, {time}: {report.verdict(apart)}.")
-    return said
-
-
 def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
     """Draw the curves of all objects."""
     for axes, (task, starts) in zip(figure.subplots(2, 3, sharey=True).flat, cells.items(), strict=True):
@@ -78,7 +69,8 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         label = RECIPES[recipe].label
         tables[f"LCS-RL from scratch and from the cube's model, {label}: success [%]"] = success(cells)
         tables[f"The differences, {label}"] = report.differences("object", pairs_of(cells), WHEN)
-        said += words(pairs_of(cells), label)
+        found = report.verdicts(pairs_of(cells), WHEN)
+        said += [f"From the cube's model against from scratch, {label}, {time}: {v}." for time, v in found.items()]
         figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
         panel(figure, cells, name.endswith("stand-in"))
         figure.suptitle(label)

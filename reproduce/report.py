@@ -153,6 +153,12 @@ def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unl
     return ", ".join([*parts, f"{UNTOLD}: {listed(unknown)}"] if unknown else parts)
 
 
+def verdicts(pairs: Pairs, when: Mapping[str, str | float], *words: str) -> dict[str, str]:
+    """Describe the differences of pairs at each time, see `verdict`."""
+    apart = {label: {name: paired_estimate(*pair, at_) for name, pair in pairs.items()} for label, at_ in when.items()}
+    return {label: verdict(differences, *words) for label, differences in apart.items()}
+
+
 def bullets(sentences: Sequence[str]) -> list[str]:
     """Format notes as a list."""
     return ["", *(f"- {sentence}" for sentence in sentences), ""] if sentences else []

@@ -361,7 +361,3 @@ def main(as_object: bool = False) -> int:
     width = min(120, shutil.get_terminal_size().columns)
     print(as_json(checks) if as_object else as_text(checks, width))
     return 0 if healthy(checks) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main("--json" in sys.argv[1:]))

@@ -91,9 +91,10 @@ def train_command(words: Sequence[str]) -> type[Train]:
         name = stored_config(RunDirectory.open(Path(out))).method.name
     kind = get_method(name or DEFAULT_METHOD)
     hidden = Annotated[kind, tyro.conf.arg(name="", prefix_name=False)]
+    methods = "; ".join(f"{name}: {get_method(name).summary}" for name in method_names())
     chosen: Any = Annotated[
         Literal[method_names()],  # pyright: ignore[reportInvalidTypeForm]
-        tyro.conf.arg(name="method", help=_methods()),
+        tyro.conf.arg(name="method", help=f"How to learn: {methods}."),
     ]
     return make_dataclass(
         "Train",
@@ -106,10 +107,6 @@ def train_command(words: Sequence[str]) -> type[Train]:
         frozen=True,
         namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None, "passed": find_flags(words)},
     )
-
-
-def _methods() -> str:
-    return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
 
 
 @dataclass(frozen=True)

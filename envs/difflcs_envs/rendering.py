@@ -3,6 +3,7 @@
 import ctypes.util
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,22 @@ def select_gl_backend() -> str:
     if chosen not in _BACKENDS:
         raise RenderingError(f"MUJOCO_GL: expected egl, osmesa, glfw or disabled, got {chosen!r}; change or unset it")
     return chosen
+
+
+def look_at(position: Sequence[float], target: Sequence[float]) -> dict[str, list[float]]:
+    """Make the pose keywords of a camera at a position [m] that looks at a target with the horizon level."""
+    backward = np.subtract(position, target)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    up = np.cross(backward, right)
+    return {"pos": list(position), "xyaxes": [*right, *up]}
+
+
+def add_sky(spec: Any, top: Sequence[float], bottom: Sequence[float], width: int) -> None:
+    """Add a sky of two colours to the spec of a scene, of so many pixels."""
+    import mujoco
+
+    sky, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    spec.add_texture(name="sky", type=sky, builtin=gradient, rgb1=top, rgb2=bottom, width=width, height=6 * width)
 
 
 def _make_gl_context(width: int, height: int) -> Any:

@@ -55,7 +55,8 @@ class ContactSelection:
             for one in check_list("of of a group", of, "name geoms or bodies"):
                 mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
                 sides = check_pair("of of a group", one) if isinstance(one, tuple) else (one, None)
-                mine[np.ix_(*(_geoms(model, side) for side in sides))] = True
+                geoms = (range(model.ngeom) if side is None else find_geoms(model, side) for side in sides)
+                mine[np.ix_(*geoms)] = True
                 self.group[(mine | mine.T) & (self.group < 0)] = i
         self.budgets = [
             Budget(
@@ -74,7 +75,3 @@ class ContactSelection:
         first, second = pairs
         mine = self.group[first, second] == 0
         return first[mine], second[mine]
-
-
-def _geoms(model: Any, of: Any) -> Sequence[int]:
-    return range(model.ngeom) if of is None else find_geoms(model, of)

@@ -141,7 +141,8 @@ def evaluate(
         parts.append(collect(env, act, episode_seeds(seed, Stream.EVALUATION, first, count), episode_steps, report))
     successes = sum(int(part["success"].sum()) for part in parts)
     low, high = wilson_interval(successes, goals)
-    errors: Any = parts[0]["errors"]
+    names: Any = parts[0]["errors"].keys()  # pyright: ignore[reportAttributeAccessIssue]
+    errors = {name: torch.cat([part["errors", name].abs() for part in parts]) for name in sorted(names)}
     return Evaluation(
         success_rate=successes / goals,
         ci_low=low,
@@ -149,12 +150,8 @@ def evaluate(
         successes=successes,
         goals=goals,
         seed=seed,
-        median_errors={name: _median(parts, name) for name in sorted(errors.keys())},
+        median_errors={name: float(values.nanquantile(0.5)) for name, values in errors.items()},
         solver_failures=sum(int(part["failures"].sum()) for part in parts),
         solves=goals * episode_steps,
         unstable=sum(int((~part["stable"]).sum()) for part in parts),
     )
-
-
-def _median(parts: list[TensorDict], name: str) -> float:
-    return float(torch.cat([part["errors", name].abs() for part in parts]).nanquantile(0.5))

@@ -54,7 +54,8 @@ def plot_learning_curve(rows: Sequence[Mapping[str, str]], path: Path, title: st
         x, success = _column(rows, "minutes", "success")
         rolling = [success[max(0, i + 1 - _ROLLING) : i + 1].mean() for i in range(len(success))]
         above.plot(x, 100 * np.array(rolling), color=_GREY, lw=1.5, label="episodes of the training")
-        x, rate, low, high, goals = _column(rows, *_evaluation("minutes", "success_rate", "ci_low", "ci_high", "goals"))
+        names = (f"evaluation_{name}" for name in ("success_rate", "ci_low", "ci_high", "goals"))
+        x, rate, low, high, goals = _column(rows, "minutes", *names)
         if len(x):
             spread = 100 * np.stack([rate - low, high - rate])
             counts = f"{goals.min():.0f}" + (f" to {goals.max():.0f}" if goals.max() > goals.min() else "")
@@ -137,10 +138,6 @@ def _write(figure: Figure, path: Path) -> None:
 
     with place_to_write(path):
         write_atomically(path, to_png(figure))
-
-
-def _evaluation(first: str, *names: str) -> list[str]:
-    return [first, *(f"evaluation_{name}" for name in names)]
 
 
 def _column(rows: Sequence[Mapping[str, str]], *names: str) -> tuple[np.ndarray, ...]:

@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from difflcs_envs.rendering import add_sky, look_at
+
 TIMESTEP, SUBSTEPS = 0.002, 50  # [s], and of them in one action of 0.1 s
 JOINT_DAMPING = 0.1  # [N m s/rad]
 DENSITY = 800.0  # [kg/m^3] of the links
@@ -58,7 +60,6 @@ OBJECTS: dict[str, tuple[Any, Any, float]] = {  # shape, its sizes or vertices [
 _LYING = {"capsule": (0.5**0.5, 0, 0.5**0.5, 0)}  # orientation of the shape in its body, along x
 
 LINK_COLOR, TIP_COLOR, PALM_COLOR = (0.22, 0.24, 0.28, 1), (0.93, 0.93, 0.95, 1), (0.30, 0.33, 0.38, 1)
-_EYE = (0.17, -0.22, 0.24)  # [m] place of the camera in front
 OBJECT_COLORS = (0.98, 0.72, 0.20), (0.20, 0.45, 0.75)
 
 
@@ -84,17 +85,9 @@ def build_model(
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = (0.35,) * 3, (0.45,) * 3
     world = spec.worldbody
     world.add_light(pos=(0.1, -0.3, 0.8), dir=(-0.1, 0.35, -1), diffuse=(0.5,) * 3)
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=(0.86, 0.90, 0.95),
-        rgb2=(0.60, 0.66, 0.74),
-        width=64,
-        height=384,
-    )
+    add_sky(spec, (0.86, 0.90, 0.95), (0.60, 0.66, 0.74), 64)
     world.add_geom(type=_GEOM.mjGEOM_PLANE, pos=(0, 0, -0.1), size=(0, 0, 0.05), rgba=(0.72, 0.76, 0.80, 1))
-    world.add_camera(name="front", pos=_EYE, xyaxes=_look_at(_EYE, (-0.005, 0.0, 0.07)))
+    world.add_camera(name="front", **look_at((0.17, -0.22, 0.24), (-0.005, 0.0, 0.07)))
     world.add_camera(name="top", pos=(-0.01, 0.0, 0.36), xyaxes=(1, 0, 0, 0, 1, 0))
     _add_hand(spec, friction, servo_gain)
     _add_object(spec, name, mass, friction)
@@ -160,12 +153,3 @@ def _add_object(spec: Any, name: str, mass: float, friction: float) -> None:
     body.add_geom(name="object", mass=mass, friction=(friction, 0.005, 0.0001), material="object", **form)
     goal = spec.worldbody.add_body(name="goal", mocap=True, pos=(0, 0, GOAL_HEIGHT))
     goal.add_geom(contype=0, conaffinity=0, mass=0, material="object", rgba=(1, 1, 1, 0.55), **form)
-
-
-def _look_at(place: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
-    """Axes (6,) of a camera at a place that looks at a target."""
-    back = np.array(place) - target
-    right = np.cross((0, 0, 1), back)
-    right /= np.linalg.norm(right)
-    up = np.cross(back, right)
-    return np.concatenate([right, up / np.linalg.norm(up)])

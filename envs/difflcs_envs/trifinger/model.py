@@ -16,6 +16,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from difflcs_envs.rendering import add_sky, look_at
+
 NUM_FINGERS = 3
 JOINTS_PER_FINGER = 3
 
@@ -237,15 +239,7 @@ def _add_scenery(spec: mujoco.MjSpec, table_friction: float) -> None:
     # The scale of the near and far planes. Left to itself MuJoCo takes it from the table.
     spec.stat.extent = 0.6
     spec.stat.center = [0.0, 0.0, 0.1]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.95, 0.98],
-        rgb2=[0.70, 0.76, 0.84],
-        width=16,
-        height=16 * 6,
-    )
+    add_sky(spec, [0.93, 0.95, 0.98], [0.70, 0.76, 0.84], 16)
     spec.add_texture(
         name="table",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -261,7 +255,7 @@ def _add_scenery(spec: mujoco.MjSpec, table_friction: float) -> None:
     world = spec.worldbody
     world.add_light(pos=[0.4, -0.5, 1.0], dir=[-0.4, 0.5, -1.0], diffuse=[0.42, 0.42, 0.40], specular=[0.2, 0.2, 0.2])
     world.add_light(pos=[-0.6, -0.3, 0.8], dir=[0.6, 0.3, -0.8], diffuse=[0.15, 0.15, 0.18], castshadow=False)
-    world.add_camera(name="front", fovy=40.0, **_look_at(position=(0.0, -0.47, 0.48), target=(0.0, 0.0, 0.13)))
+    world.add_camera(name="front", fovy=40.0, **look_at((0.0, -0.47, 0.48), (0.0, 0.0, 0.13)))
     world.add_camera(name="top", fovy=40.0, pos=[0.0, 0.0, 0.55], xyaxes=[1, 0, 0, 0, 1, 0])
     world.add_geom(
         name="table",
@@ -273,14 +267,6 @@ def _add_scenery(spec: mujoco.MjSpec, table_friction: float) -> None:
         contype=TABLE_BIT,
         conaffinity=0,
     )
-
-
-def _look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> dict[str, list[float]]:
-    """Make the pose keywords of a camera at `position` that looks at `target` with the horizon level."""
-    backward = np.subtract(position, target)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    up = np.cross(backward, right)
-    return {"pos": list(position), "xyaxes": [*right, *up]}
 
 
 def _add_object(spec: mujoco.MjSpec, scene_object: SceneObject) -> None:

@@ -219,9 +219,6 @@ class TriFingerPhysics:
 
     # --- save and restore -------------------------------------------------------------------------
 
-    def _save(self) -> None:
-        mujoco.mj_getState(self.model, self.data, self._saved, _STATE_SIGNATURE)
-
     def restore(self) -> None:
         """Go back to the state before the last step."""
         mujoco.mj_resetData(self.model, self.data)
@@ -230,7 +227,7 @@ class TriFingerPhysics:
 
     def get_full_state(self) -> np.ndarray:
         """Return everything that the next steps depend on, as one vector."""
-        self._save()
+        mujoco.mj_getState(self.model, self.data, self._saved, _STATE_SIGNATURE)
         return self._saved.copy()
 
     def set_full_state(self, full_state: np.ndarray) -> None:
