@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from difflcs._checks import FLOATS, is_array
+
 T = TypeVar("T")
 
 MOST_NUMBERS = 4096
@@ -56,9 +58,14 @@ def _numbers(arrays: Sequence[np.ndarray]) -> list[bytes]:
     return list(map(np.ndarray.tobytes, arrays))
 
 
-def comparable(values: Sequence[object]) -> bool:
-    """Return whether the numbers of all tensors among them can be compared, and quickly."""
-    return all(value.is_cpu and value.numel() <= MOST_NUMBERS for value in values if isinstance(value, Tensor))
+def snapshot(values: Sequence[object]) -> Snapshot | None:
+    """Take a snapshot if the numbers of all tensors among them can be compared, and quickly.
+
+    Take it before something is made of them: what another thread changes meanwhile is then noticed at the next call.
+    """
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    quick = all([is_array(v) and v.dtype in FLOATS and v.numel() <= MOST_NUMBERS for v in tensors])
+    return Snapshot(values) if quick else None
 
 
 class Recall(Generic[T]):
@@ -72,10 +79,9 @@ class Recall(Generic[T]):
         kept = self._kept  # once: another thread may keep something else
         return kept[0] if kept is not None and kept[1].same(tensors) else None
 
-    def keep(self, value: T, tensors: Sequence[Tensor]) -> None:
-        """Keep a value and a snapshot of its tensors, if they can be compared, and quickly."""
-        if comparable(tensors):
-            self._kept = value, Snapshot(tensors)
+    def keep(self, value: T, before: Snapshot | None) -> None:
+        """Keep a value and the snapshot of its tensors that was taken before it was made of them."""
+        self._kept = None if before is None else (value, before)
 
     def __reduce__(self) -> tuple[type, tuple]:
         return Recall, ()

@@ -23,7 +23,7 @@ from difflcs._checks import (
 from difflcs._differentiation import runs_eagerly, transforms_active
 from difflcs._linalg import product
 from difflcs._modules import fresh, plain_state, untouched
-from difflcs._recall import Recall
+from difflcs._recall import Recall, snapshot
 from difflcs.constraints import check_bounds
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
 from difflcs.records import SYSTEM, LCSParams, LCSPrediction, advance, check_inputs
@@ -191,9 +191,10 @@ class LCSModel(PredictiveModule):
         if kept is not None and kept[0] == self.stiffness:
             F = kept[1].clone()
             return LCSParams.of_checked({name: F if name == "F" else parameters[name] for name in SYSTEM})
+        before = snapshot(tensors) if recalls else None
         params = LCSParams(**{name: self.F if name == "F" else parameters[name] for name in SYSTEM})
         if recalls:
-            self._made.keep((self.stiffness, params.F.clone()), tensors)
+            self._made.keep((self.stiffness, params.F.clone()), before)
         return params
 
     @classmethod

@@ -18,7 +18,7 @@ from torch import Tensor
 from difflcs._checks import all_finite, check_tensor, is_array
 from difflcs._differentiation import forward_mode_active, transforms_active
 from difflcs._modules import untouched
-from difflcs._recall import Snapshot, comparable
+from difflcs._recall import Snapshot, snapshot
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.lcs import LCSModel
@@ -44,17 +44,20 @@ class Repeat:
         Raises:
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
-        last, signature = self._last, _signature(call)  # once: another thread may keep something else
+        last, signature = self._last, _signature(setup, call)  # once: another thread may keep something else
         if last is not None and signature is not None and last.fits(setup, call, signature):
             start = last.start(call)
             solver = last.solver(setup, call)
             solver.began = setup.began
             return solver, solver.run(start, call.x0.device)
+        mappings = _tensor_mappings(setup, call) if signature is not None else None
+        values = [] if mappings is None else _values(setup, call, mappings)
+        if signature is None or mappings is None or _differentiated([*values, *_inputs(call)]):
+            return solve_call(setup, call)
+        before, goal = snapshot(values), snapshot([call.goal])
         solver, outputs = solve_call(setup, call)
-        if signature is not None and not solver.needs_grad and setup.limits is None:
-            mappings = _tensor_mappings(setup, call)
-            if mappings is not None and comparable([*_values(setup, call, mappings), call.goal]):
-                self._last = _Prepared(setup, call, signature, mappings, solver)
+        if before is not None and goal is not None:
+            self._last = _Prepared(signature, mappings, before, goal, solver)
         return solver, outputs
 
     def __reduce__(self) -> tuple[type, tuple]:
@@ -65,11 +68,14 @@ class _Prepared:
     """Copy of a problem that a layer has solved, with a snapshot of the values that it was made of."""
 
     def __init__(
-        self, setup: Setup, call: Call, signature: tuple, mappings: list[Mapping[str, object]], solver: MPCSolver
+        self,
+        signature: tuple,
+        mappings: list[Mapping[str, object]],
+        before: Snapshot,
+        goal: Snapshot,
+        solver: MPCSolver,
     ):
-        self.mappings, self.snapshot = mappings, Snapshot(_values(setup, call, mappings))
-        self.signature, self.settings = signature, _settings(setup)
-        self.latest = solver.copy(), None if call.goal is None else Snapshot([call.goal])
+        self.signature, self.mappings, self.snapshot, self.latest = signature, mappings, before, (solver.copy(), goal)
         inputs, problem = solver.inputs, solver.problem
         shapes = [(inputs.horizon + extra, inputs.sizes[size]) for extra, size in GUESS.values()]
         self.flat = [torch.Size((problem.batch, *shape)) for shape in shapes]
@@ -79,19 +85,18 @@ class _Prepared:
         """Return whether a call can differ from the last only in the numbers of its arguments."""
         return (
             signature == self.signature
-            and _settings(setup) == self.settings
             and self.snapshot.same(_values(setup, call, self.mappings))
-            and not (torch.is_grad_enabled() and any(v.requires_grad for v in (*self.snapshot.tensors, *_inputs(call))))
+            and not _differentiated([*self.snapshot.tensors, *_inputs(call)])
         )
 
     def solver(self, setup: Setup, call: Call) -> MPCSolver:
         """Make the solver of a call: from its state, to its goal, with its system if it has one."""
         (solver, same), (x0, goal, lcs) = self.latest, (call.x0, call.goal, call.lcs)
-        if goal is not None and same is not None and not same.same([goal]):
+        if not same.same([goal]):
             cost: Any = setup.cost  # a GoalCost, as there is a goal
-            made = cost.at(goal, setup.horizon)
+            same, made = Snapshot([goal]), cost.at(goal, setup.horizon)
             solver = solver.with_inputs({name: made[name] for name in ("q", "q_final", "constant")})
-            self.latest = solver, Snapshot([goal])
+            self.latest = solver, same
         if lcs is not None:
             lcs.check_again()  # pyright: ignore[reportAttributeAccessIssue]
             return solver.with_inputs({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
@@ -128,17 +133,23 @@ def _inputs(call: Call) -> list[Tensor]:
     return tensors if call.lcs is None else [*tensors, *call.lcs.tensors().values()]  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _signature(call: Call) -> tuple | None:
-    """Return the shapes and dtypes of a call's arguments; None if it cannot be repeated, or must be refused."""
-    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, *rest = call
-    if not (reference is u_min is u_max is bounds is cost is constraints is None) or any(v is not None for v in rest):
+def _differentiated(values: list[object]) -> bool:
+    """Return whether a gradient can be asked of what is made of these."""
+    return torch.is_grad_enabled() and any([isinstance(v, Tensor) and v.requires_grad for v in values])
+
+
+def _signature(setup: Setup, call: Call) -> tuple | None:
+    """Return what a plan depends on besides tensors; None if a call cannot be repeated, or must be refused."""
+    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, context, along = call
+    if not (reference is u_min is u_max is bounds is cost is constraints is context is along is setup.limits is None):
         return None
     if not _is_double(x0) or not (goal is None or is_array(goal)) or transforms_active() or forward_mode_active():
         return None
     if not (lcs is None or (type(lcs) is LCSParams and lcs.A.is_cpu)):
         return None
     shapes = None if lcs is None else [value.shape for value in lcs.tensors().values()]
-    return x0.shape, None if goal is None else (goal.shape, goal.dtype), shapes
+    settings = setup.horizon, setup.relaxation, setup.barrier, getattr(setup.lcs, "stiffness", None)
+    return x0.shape, None if goal is None else (goal.shape, goal.dtype), shapes, settings
 
 
 def _reshape(value: Tensor, shape: torch.Size) -> Tensor:
@@ -172,8 +183,3 @@ def _values(setup: Setup, call: Call, mappings: list[Mapping[str, object]]) -> l
     """Collect all values that a plan depends on, except the arguments of the call."""
     values = [*_parts(setup, call), setup.backend, setup.u_min, setup.u_max]
     return values + [value for mapping in mappings for value in mapping.values()]
-
-
-def _settings(setup: Setup) -> tuple:
-    """Collect the numbers that a plan depends on, including those that a model holds besides its tensors."""
-    return setup.horizon, setup.relaxation, setup.barrier, getattr(setup.lcs, "stiffness", None)

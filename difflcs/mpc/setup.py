@@ -410,7 +410,7 @@ class Inputs:
         for name, tensor in tensors.items():
             value, by_stage = tensor.detach(), name in self.by_stage
             if value.dtype is not torch.float64 or not value.is_cpu:
-                value = value.to("cpu", torch.float64)
+                value = check_tensor(name, value, finite=False).to("cpu", torch.float64)
             leading = value.ndim - RANKS[name] - by_stage
             if leading or name == "x0":
                 lead, shape = value.shape[:leading], value.shape[leading:]

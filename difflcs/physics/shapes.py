@@ -18,7 +18,7 @@ from torch import Tensor
 
 from difflcs._checks import check_array, check_list, check_number, check_shape, check_tensor, describe
 from difflcs._differentiation import transforms_active
-from difflcs._recall import Recall
+from difflcs._recall import Recall, snapshot
 from difflcs.errors import InvalidInputError
 
 _ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
@@ -162,12 +162,12 @@ class Polygon(Shape):
         kept = made.value((self.vertices,)) if recalls else None
         if kept is not None:
             return kept
-        corners = self.corners
+        before, corners = snapshot((self.vertices,)) if recalls else None, self.corners
         side = corners.roll(-1, 0) - corners
         square = side.square().sum(-1)
         sides = (corners, side, square, torch.stack([side[:, 1], -side[:, 0]], -1) / square.sqrt().unsqueeze(-1))
         if recalls:
-            made.keep(sides, (self.vertices,))
+            made.keep(sides, before)
         return sides
 
     def moments(self) -> Moments:

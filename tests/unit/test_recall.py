@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, StageBounds
+from difflcs._linalg import product
 from difflcs.errors import BoundsError, DTypeError, NonFiniteError, NotPositiveDefiniteError, ShapeError
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import BatchedBackend
@@ -297,6 +298,7 @@ def test_errors_are_those_of_a_first_call():
     refused(NonFiniteError, "^goal", lambda layer: None, X, GOAL * torch.inf)
     refused(NonFiniteError, "^A", lambda layer: layer.lcs.A.data.fill_(torch.nan), X, GOAL)
     refused(NonFiniteError, "^Q", lambda layer: layer.cost.Q.fill_(torch.nan), X, GOAL)
+    refused(DTypeError, "^Q.*bfloat16", lambda layer: layer.cost.bfloat16(), X, GOAL)
     refused(NonFiniteError, "^q", lambda layer: layer.cost.goal_to_q.fill_(torch.inf), X, GOAL)
     refused(BoundsError, "u_min", lambda layer: layer.u_max.fill_(-1.0), X, GOAL)
     refused(ShapeError, "batch dimensions", lambda layer: None, X.expand(2, -1), GOAL.expand(3, -1))
@@ -369,3 +371,15 @@ def test_threads_share_a_layer():
         for i, found in enumerate(pool.map(work, range(4))):
             for k, solution in enumerate(found):
                 assert_same(solution, expected[(i + k) % 4])
+
+
+def test_what_another_thread_changes_while_a_plan_is_made_is_noticed(monkeypatch):
+    layer = make_layer()
+
+    def meanwhile(*factors):
+        monkeypatch.undo()
+        return product(*factors), layer.lcs.G.data.mul_(1.5)
+
+    monkeypatch.setattr("difflcs.lcs.product", lambda *factors: meanwhile(*factors)[0])
+    plan(layer, X, GOAL)
+    assert_as_fresh(layer, X, GOAL)
