@@ -351,7 +351,8 @@ def test_smoke_is_valid_and_small(name):
         if value != before[key]:
             assert 0 < value < before[key], key
     tiny = TrainConfig(task="toy", method=usual, minutes=0.1 if name != "lcs-rl" else 5.0)
-    assert tiny.smoke().minutes <= tiny.minutes
+    tiny, asked = tiny.smoke(), tiny.minutes
+    assert (tiny.minutes <= asked, tiny.evaluate_goals, tiny.final_goals) == (True, 4, 4)
 
 
 def test_its_configuration_survives_json(name):

@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 import difflcs_envs  # noqa: F401
 from difflcs.rl.tasks import get_task
@@ -33,6 +34,13 @@ def test_the_object_rests_on_the_palm_within_open_fingers(name):
     assert after["state"][18] == pytest.approx(PALM_TOP + OBJECTS[name][2], abs=2e-3)
     assert min(contact.dist for contact in env.data.contact) > -2e-3
     assert env.describe() == {"name": name, "mass": pytest.approx(0.07), "friction": 0.4, "servo_gain": 2.0}
+
+
+@pytest.mark.parametrize(("name", "size", "volume"), [("house", (50, 40, 50), 82.5), ("nut", (60, 51.96, 40), 93.53)])
+def test_meshes_have_their_sizes(name, size, volume):
+    corners = 1000 * OBJECTS[name][1]  # [mm]
+    np.testing.assert_allclose([corners.min(0), corners.max(0)], np.outer([-0.5, 0.5], size), atol=0.01)
+    assert 1e-3 * ConvexHull(corners).volume == pytest.approx(volume, rel=1e-3)
 
 
 def test_the_goal_is_a_quarter_turn_away_to_either_side():
