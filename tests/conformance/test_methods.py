@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
@@ -182,8 +183,10 @@ def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(name, finished, tm
             with pytest.raises(KeyboardInterrupt):
                 train(make_config(name), path, resume=attempt > 0)
     assert saved == ["kept", "lost", "lost"]
-    rows = train(make_config(name), path, resume=True).rows()
-    assert [row["iteration"] for row in rows] == [row["iteration"] for row in whole.rows()]
+    run = train(make_config(name), path, resume=True)
+    assert [row["iteration"] for row in run.rows()] == [row["iteration"] for row in whole.rows()]
+    events = EventAccumulator(str(run.tensorboard)).Reload()
+    assert [event.step for event in events.Scalars("minutes")] == [int(row["env_steps"]) for row in run.rows()]
 
 
 def test_a_state_decides_everything_that_follows(name, make_trainer):
