@@ -6,6 +6,7 @@ Tasks and methods are known by their registries only.
 import sys
 from collections.abc import Sequence
 
+from difflcs import __version__
 from difflcs._optional import require
 from difflcs.errors import MissingDependencyError
 
@@ -21,6 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         installed, 130 after Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"difflcs {__version__}")
+        return 0
     try:
         from difflcs.cli import commands
 

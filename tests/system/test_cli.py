@@ -180,6 +180,7 @@ def run_of(out: Path) -> SimpleNamespace:
         (["train", "--task", "cubes"], "did you mean cube"),
         (["train", "--backend", "batchd"], "did you mean batched"),
         (["evaluate", "zoo:trifinger-cub"], "did you mean trifinger-cube"),
+        (["evaluate", "cubee"], "did you mean cube"),
         (["zoo", "trifingercube"], "did you mean trifinger-cube"),
         (["evaluate", "nowhere"], "difflcs train"),
         (["render", "nowhere"], "difflcs train"),

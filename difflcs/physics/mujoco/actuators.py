@@ -214,7 +214,7 @@ def disabled_actuators(model: Any) -> NDArray[np.bool_]:
 
 def check_model(model: Any, data: Any, motion: str) -> None:
     """Check that a model and its data are such as a motion has."""
-    check_kind("model", model, mujoco.MjModel, "load one with MjModel")
+    check_kind("model", model, mujoco.MjModel, "load one, MjModel.from_xml_path, or compile its MjSpec")
     check_kind("data", data, (mujoco.MjData, type(None)), "pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")

@@ -386,8 +386,8 @@ def find_geoms(model: Any, name: int | str) -> list[int]:
         geoms = [int(name)] if isinstance(name, int | np.integer) and 0 <= name < model.ngeom else []
     if not geoms:
         raise InvalidInputError(
-            f"pairs: expected names of geoms or bodies, or numbers of geoms below {model.ngeom}, got {name!r:.100}; "
-            f"see the names in the model's XML"
+            f"pairs, contacts: expected names of geoms or bodies, or numbers of geoms below {model.ngeom}, got "
+            f"{name!r:.100}; see the names in the model's XML"
         )
     return geoms
 

@@ -48,7 +48,7 @@ class MujocoState:
     """
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
-        check_kind("model", model, mujoco.MjModel, "load one, MjModel.from_xml_path")
+        check_kind("model", model, mujoco.MjModel, "load one, MjModel.from_xml_path, or compile its MjSpec")
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
         self.na = int(model.na) if velocities else 0
         names: list[str] = []

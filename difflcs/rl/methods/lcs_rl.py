@@ -39,7 +39,7 @@ class LCSRLMethod(LCSMethod):
         if minutes <= self.warmup_minutes:
             raise InvalidInputError(
                 f"minutes: expected more than the {self.warmup_minutes:g} of the warm-up with lcs-rl, got "
-                f"{minutes:g}; pass --minutes 30, or --method violation for a warm-up alone"
+                f"{minutes:g}; pass --minutes 30, a shorter --warmup-minutes, or --method violation for a warm-up alone"
             )
 
     def trainer(self, work: Work) -> Trainer:

@@ -224,7 +224,9 @@ def _captioned(env: gymnasium.Env[Any, Any], text: str, verdict: str) -> np.ndar
     try:
         picture = Image.fromarray(np.asarray(env.render()))
     except Exception as error:  # whatever a renderer of others may raise
-        raise NoPictureError(f"{type(error).__name__}: {error}") from error
+        raise NoPictureError(
+            f"{type(error).__name__}: {error}; where there is no screen, set MUJOCO_GL=egl before Python starts"
+        ) from error
     draw = ImageDraw.Draw(picture, "RGBA")
     size = max(10, picture.height // 30)
     font = ImageFont.load_default(size)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from difflcs import _storage, zoo
+from difflcs._checks import did_you_mean
+from difflcs.errors import CheckpointError
 from difflcs.rl.methods import ContactMethod, get_method
 from difflcs.rl.methods.contact_lcs import known_physics
 from difflcs.rl.rollout import Policy
@@ -67,6 +70,11 @@ class TrainedPolicy:
             learned = method.rebuild(task, *_storage.load_record(zoo.path(name), method.kind), name)
             policy = method.policy(task, learned)
             return cls(name, known.task, known.method, known.backend, policy, True, known.object, card=known)
+        if not os.path.exists(name):  # False for what can be no path
+            raise CheckpointError(
+                f"{name}: expected a directory written by `difflcs train`, zoo:NAME or a task, found none of them"
+                f"{did_you_mean(name, task_names())}"
+            )
         run = RunDirectory.open(source)
         config, description = stored_config(run), run.config().get("object")
         description = description if isinstance(description, dict) else None

@@ -213,21 +213,23 @@ def load_model(path: Path | str) -> LCSModel:
     method = stored_config(run).method
     if not method.takes_init:
         raise CheckpointError(
-            f"{path}: expected a run that learned an LCSModel, got one of {method.name}: {method.kind}"
+            f"{path}: expected a run that learned an LCSModel, got one of {method.name}: {method.kind}; to "
+            f"go on with {method.name}, train it anew for more minutes"
         )
     return LCSModel.from_config(*run.learned(LCSMethod.kind), str(path))
 
 
-def load_policy(run: RunDirectory, task: TaskSpec | None = None) -> Policy:
+def load_policy(run: RunDirectory | Path | str, task: TaskSpec | None = None) -> Policy:
     """Load the policy of a run: the final one if the run is finished, else that of its latest checkpoint.
 
     Args:
-        run: the run.
+        run: the run, or its directory.
         task: its task, if it is not to be looked up by its name.
 
     Raises:
         CheckpointError: there is none, or it does not fit the run's configuration.
     """
+    run = run if isinstance(run, RunDirectory) else RunDirectory.open(run)
     config = stored_config(run)
     spec = get_task(config.task if task is None else task)
     learned = config.method.rebuild(spec, *run.learned(config.method.kind), str(run.path))
