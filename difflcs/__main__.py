@@ -27,7 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return cli.main(words)
         finally:
-            _flush()  # here and not when Python ends, where nobody could handle an error
+            for stream in (sys.stdout, sys.stderr):
+                if stream is not None:  # None without a console
+                    stream.flush()  # here and not when Python ends, where nobody could handle an error
     except KeyboardInterrupt:  # before the command line could say what to do, such as while it is imported
         print("\ndifflcs: interrupted; nothing was changed", file=sys.stderr)
         return _INTERRUPTED
@@ -35,12 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not _reader_gone():
             raise
         return _READER_GONE
-
-
-def _flush() -> None:
-    for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # None without a console
-            stream.flush()
 
 
 def _reader_gone() -> bool:

@@ -227,9 +227,11 @@ def fit_report(
             return system_at(system, x, None if context is None else context[rows])  # pyright: ignore[reportReturnType]
 
         move = x_next - x
-        step, spread = (_positive(v) for v in (_rms(move), x.std(0, correction=0)))
+        # What never moves counts in its own unit.
+        step, spread = (torch.where(v > 0, v, torch.ones_like(v)) for v in (_rms(move), x.std(0, correction=0)))
         prediction = advance(params, x, u)
-        solution = _least_squares(*_check_training(train or (x, u, x_next), x, u))
+        x_fit, u_fit, x_next_fit = _check_training(train or (x, u, x_next), x, u)
+        solution = torch.linalg.lstsq(_regressors(x_fit, u_fit), x_next_fit - x_fit).solution
 
         squared = ((prediction.x_next - x_next) / step).square().sum(1)
         lam, without = prediction.lam, []
@@ -299,19 +301,9 @@ def _regressors(x: Tensor, u: Tensor) -> Tensor:
     return torch.cat([x, u, torch.ones_like(x[:, :1])], 1)
 
 
-def _least_squares(x: Tensor, u: Tensor, x_next: Tensor) -> Tensor:
-    """Fit moves by an affine function of state and action; (n_x + n_u + 1, n_x)."""
-    return torch.linalg.lstsq(_regressors(x, u), x_next - x).solution
-
-
 def _affine(solution: Tensor, x: Tensor, u: Tensor) -> Tensor:
     return x + _regressors(x, u) @ solution
 
 
 def _rms(rows: Tensor) -> Tensor:
     return rows.square().mean(0).sqrt()
-
-
-def _positive(scale: Tensor) -> Tensor:
-    """Replace zeros by one: what never moves counts in its own unit."""
-    return torch.where(scale > 0, scale, torch.ones_like(scale))

@@ -31,13 +31,6 @@ from difflcs.records import SYSTEM, LCSParams, LCSPrediction, advance, check_inp
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
-def _check_support(support: object, n_u: int) -> Tensor:
-    """Check lower and upper bounds (2, n_u) of actions."""
-    support = check_shape("action_support", support, f"2 {n_u}")
-    check_bounds(support[0], support[1])
-    return support.detach()
-
-
 class PredictiveModule(nn.Module):
     """A module of an LCS that predicts steps and trajectories of it; subclasses have sizes and `params`."""
 
@@ -141,7 +134,9 @@ class LCSModel(PredictiveModule):
             self.register_parameter(name, nn.Parameter(value.to(dtype)))
         self.c.requires_grad_(check_kind("learn_c", learn_c, bool))
         if action_support is not None:
-            action_support = _check_support(action_support, self.n_u).to(dtype, copy=True)
+            support = check_shape("action_support", action_support, f"2 {self.n_u}")
+            check_bounds(support[0], support[1])
+            action_support = support.detach().to(dtype, copy=True)
         self.register_buffer("action_support", action_support)
         self._made: Recall[tuple[float, Tensor]] = Recall()
 

@@ -27,18 +27,8 @@ struct LcpOne {
     };
     F = take(n * n);
     M = take(n * n);
-    scale = take(n);
-    q = take(n);
-    lam = take(n);
-    w = take(n);
-    x = take(n);
-    y = take(n);
-    step = take(n);
-    rows = take(n);
-    active = take(n);
-    path = take(n);
-    gap = take(n);
-    best = take(n);
+    double** const vectors[] = {&scale, &q, &lam, &w, &x, &y, &step, &rows, &active, &path, &gap, &best};
+    for (double** vector : vectors) *vector = take(n);
     const double *from = batch.F + e * batch.F_stride, *right = batch.q + e * n;
     unit = __builtin_sqrt(batch.relaxation);
     for (int64_t i = 0; i < n; i++) {

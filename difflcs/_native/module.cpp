@@ -245,6 +245,13 @@ struct Threads final : difflcs::Runner {
   bool stopped() const override { return stop.ending != kGoOn; }
 };
 
+void check_plans(const difflcs::MpcBatch& b, int64_t x, int64_t u, int64_t lam, int64_t mu) {
+  check_size("x", x, b.count * (b.horizon + 1) * b.n_x);
+  check_size("u", u, b.count * b.horizon * b.n_u);
+  check_size("lam", lam, b.count * b.horizon * b.n_lam);
+  check_size("mu", mu, b.count * (b.horizon + 1) * b.n_c);
+}
+
 // Returns whether every problem is CONVERGED, so that callers can skip further checks.
 bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, uint64_t seed,
@@ -254,20 +261,15 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
                Output<int32_t> iterations) {
   difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
   b.version = version_of(b);
-  const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
-  const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states);
-  check_size("u", u.size(), actions);
-  check_size("lam", lam.size(), forces);
-  check_size("mu", mu.size(), rows);
+  check_plans(b, x.size(), u.size(), lam.size(), mu.size());
   check_size("objective", objective.size(), b.count);
   check_size("residual", residual.size(), b.count);
   check_size("status", status.size(), b.count);
   check_size("iterations", iterations.size(), b.count);
   check_size("fragile", fragile.size(), b.count);
-  if (u_start) check_size("u_start", u_start->size(), actions);
-  if (lam_start) check_size("lam_start", lam_start->size(), forces);
-  if (mu_start) check_size("mu_start", mu_start->size(), rows);
+  if (u_start) check_size("u_start", u_start->size(), u.size());
+  if (lam_start) check_size("lam_start", lam_start->size(), lam.size());
+  if (mu_start) check_size("mu_start", mu_start->size(), mu.size());
   if (!(starts >= 1 && homotopy >= 0 && shrink > 0 && shrink < 1))
     throw std::invalid_argument("starts must be at least 1, the homotopy must fall");
   if (lam_start && !(u_start && mu_start)) throw std::invalid_argument("lam_start needs u_start and mu_start");
@@ -289,28 +291,13 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
              std::vector<Output<double>> gradients) {
   using namespace difflcs;
   const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
-  const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
-  const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states);
-  check_size("u", u.size(), actions);
-  check_size("lam", lam.size(), forces);
-  check_size("mu", mu.size(), rows);
-  check_size("x_bar", x_bar.size(), states);
-  check_size("u_bar", u_bar.size(), actions);
-  check_size("lam_bar", lam_bar.size(), forces);
+  check_plans(b, x.size(), u.size(), lam.size(), mu.size());
+  check_plans(b, x_bar.size(), u_bar.size(), lam_bar.size(), mu.size());
   check_size("objective_bar", objective_bar.size(), b.count);
   check_size("solved", solved.size(), b.count);
   check_size("gradients", gradients.size(), kInputs);
-  MpcGradient o{};
-  o.x = x.data();
-  o.u = u.data();
-  o.lam = lam.data();
-  o.mu = mu.data();
-  o.x_bar = x_bar.data();
-  o.u_bar = u_bar.data();
-  o.lam_bar = lam_bar.data();
-  o.objective_bar = objective_bar.data();
-  o.solved = solved.data();
+  MpcGradient o{x.data(),     u.data(),       lam.data(),           mu.data(),    x_bar.data(),
+                u_bar.data(), lam_bar.data(), objective_bar.data(), solved.data()};
   for (int i = 0; i < kInputs; i++) {
     check_size("gradient", gradients[i].size(), inputs[i].size());
     std::fill_n(gradients[i].data(), gradients[i].size(), 0.0);
