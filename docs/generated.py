@@ -29,6 +29,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import enum
 import importlib
 import importlib.util
 import inspect
@@ -234,10 +235,39 @@ def summary(value: Any) -> str:
     return first.replace("|", "\\|").replace("<", "&lt;")
 
 
+SHOWN = (int, float, str, tuple, type(None))
+
+
+def call(value: Any) -> str:
+    """How a function or class is called, without types: `(x, u, *, gamma=0.1)`; "" for what nobody calls."""
+    uncalled = (BaseException, enum.Enum)
+    if not callable(value) or (inspect.isclass(value) and (issubclass(value, uncalled) or is_interface(value))):
+        return ""
+    plain = [one.replace(annotation=one.empty) for one in inspect.signature(value).parameters.values()]
+    signature = inspect.Signature([one.replace(default=short(one.default)) for one in plain])
+    text = str(signature).replace("Ellipsis", "…")
+    if len(text) <= 240:
+        return text
+    needed = [one.name for one in plain if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
+    return f"({', '.join([*needed, '…'])})"
+
+
+def short(default: Any) -> Any:
+    """A default as a page shows it: numbers and words as they are, any other object as dots."""
+    return default if default is inspect.Parameter.empty or isinstance(default, SHOWN) else ...
+
+
+def is_interface(kind: type) -> bool:
+    """Tell whether a class is one to write others of."""
+    return getattr(kind, "_is_protocol", False) or inspect.isabstract(kind)
+
+
 def api_summary(module: str, *names: str) -> str:
     """Markdown: a table of public names, for who reads it in the repository."""
     owner = importlib.import_module(module)
-    rows = [f"| `{name}` | {summary(getattr(owner, name))} |" for name in names or owner.__all__]
+    rows = [
+        f"| `{name}{call(getattr(owner, name))}` | {summary(getattr(owner, name))} |" for name in names or owner.__all__
+    ]
     return "\n".join(["| name | meaning |", "|---|---|", *rows])
 
 
@@ -289,6 +319,14 @@ def _table(rows: list[str], indent: str) -> list[str]:
         for k, cell in enumerate(row):
             out.append(f"{indent}   {'* -' if k == 0 else '  -'} {_inline(cell)}")
     return [*out, ""]
+
+
+def name_array_like(app: Any, what: str, name: str, obj: Any, options: Any, arguments: str, returns: str) -> Any:
+    """NumPy's `ArrayLike` by its name instead of the many types that it stands for."""
+    return arguments and ARRAY_LIKE.sub("ArrayLike", arguments), returns
+
+
+ARRAY_LIKE = re.compile(r"[~\w.]*_Buffer \| .*?_NestedSequence\[[~\w.]*complex \|[^]]*\]")
 
 
 def skip_member(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
@@ -493,6 +531,7 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("source-read", read_source)
     app.connect("env-get-outdated", always_read)
     app.connect("autodoc-process-docstring", mend_docstring, priority=400)  # before napoleon
+    app.connect("autodoc-process-signature", name_array_like)
     app.connect("autodoc-skip-member", skip_member)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
