@@ -39,8 +39,10 @@ class Actuators:
         follows: (nu,) True if it has no activation, or one that goes to its control.
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
-        usual: (nu,) size of actions where there is no range: 1, and none of a servo on a slide, for a metre.
+        usual: (nu,) size of actions where there is no range: 1; of a servo on a slide, for a metre, half as much again
+            as the joint's limits leave.
         reach: (nu,) size of actions: half of the range, or 1.
+        brakes: (nv,) damping by drives on slides and hinges whose force is limited.
         curved: (k,) those with a range whose force is not linear in the control, such as dampers and muscles.
     """
 
@@ -67,12 +69,16 @@ class Actuators:
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
         slides = self.holds & (self.dof >= 0) & (model.jnt_type[model.dof_jntid[self.dof]] == _SCALAR[0])
-        self.usual = np.where(slides, 0.0, 1.0)
+        joints = model.dof_jntid[self.dof]
+        width = np.ptp(model.jnt_range[joints], axis=1) * model.jnt_limited[joints]
+        self.usual = np.where(slides, 1.5 * np.abs(self.gear) * width, 1.0)
         self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
         plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
         self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
+        brakes = np.where(np.isfinite(self._force).any(0) & (self.dof >= 0), -damping * self.gear**2, 0.0)
+        self.brakes = np.bincount(self.dof.clip(0), brakes.clip(0), minlength=model.nv)
         self._exact = np.flatnonzero(dynamics == _EXACT)
         self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
         self._decays = dynamics[self.activated] == _EXACT

@@ -37,6 +37,19 @@ class EqualityRows(NamedTuple):
     damping: Array
     force: Array
 
+    def push(self, stiff: Array, factor: Array) -> Array:
+        """Return the part of K (n, nv, nv) that drives the constraints apart; M⁻¹ is L Lᵀ of the `factor` L.
+
+        An impedance that grows with the violation takes a larger part of a load there, though less of it is left: as
+        far as the derivative sees, the constraint pushes on.
+        """
+        along = self.normal @ factor
+        within = np.linalg.pinv(along, _DEPENDENT) @ along
+        held = within @ np.linalg.solve(factor, stiff @ factor) @ within
+        size, directions = np.linalg.eigh(0.5 * (held + held.swapaxes(-1, -2)))
+        grows = directions * np.maximum(size, 0.0)[:, None] @ directions.swapaxes(-1, -2)
+        return factor @ grows @ np.linalg.inv(factor)
+
 
 class Equality:
     """The equality constraints of a model that are active.

@@ -30,7 +30,7 @@ from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
-from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
+from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
 from difflcs.physics.mujoco.native import TAKEN, check_readable, flags, native, taken
 from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
@@ -241,7 +241,7 @@ class MujocoLCS:
             FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in zip(free, (2, 2, 1, 2), strict=True))),
             read.batched(read.x),
             read.batched(contacts.friction),
-            np.full(contacts.gap.shape[1] + rows.gap.shape[1], self.compliance),
+            read.batched(soften(rows, found, step, self._give, self.compliance, contacts.gap.shape[1])),
             self.cone,
             self.length,
             self.length / self._give,
@@ -431,7 +431,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
     at, to, alone = (v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
-    warn_of_wrong(at[0], to[0], alone, step.velocity[some], step.inverse_mass[some], of._model)
+    warn_of_wrong(at[0], to[0], alone, step.velocity[some], read.moved.inverse_mass[some], of._model)
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

@@ -51,8 +51,14 @@ class Softness(NamedTuple):
     @property
     def creep(self) -> Array:
         """Largest speed at which friction that holds creeps; infinite for limits."""
+        return self.bound * self.yields(1.0, np.inf)
+
+    def yields(self, mass: Array | float, seconds: float) -> Array:
+        """Speed (n, k) for a unit of force at which friction that holds creeps after a time, where A is `mass`."""
         d = _impedance(np.zeros_like(self.give), self.impedance)
-        return self.bound * (1 - d) / d * self.give / self.damping
+        firm = (1 - d) / d * self.give
+        rate = self.damping * mass / np.maximum(mass + firm, 1e-300)
+        return firm / self.damping * -np.expm1(-rate * seconds)
 
     def at(self, index: Any) -> Softness:
         """Return those of some rows."""
@@ -262,6 +268,17 @@ def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: fl
         seconds * rows.soft.bound[:, unit.shape[1] - rows.n_friction :] / np.where(of_friction > 0, of_friction, 1.0)
     )
     return ScaledRows(unit * part * gap, impulse * np.reshape(part, (*np.shape(part), 1)), impulse, bound, unit)
+
+
+def soften(
+    rows: ScaledRows, found: Rows, step: DynamicStep | None, give: float, compliance: float, n_contacts: int
+) -> Array:
+    """Compliance (n, n_contacts + k) of contacts and rows; friction in a step with velocities creeps as MuJoCo's."""
+    soft = np.full((len(rows.gap), n_contacts + rows.gap.shape[1]), compliance)
+    if step is not None and (n := found.n_friction):
+        creeps = found.soft.yields(give_way(found.normal, step.inverse_mass), step.seconds)[:, -n:] / give
+        soft[:, -n:] = np.maximum(compliance, rows.unit[:, -n:] ** 2 * creeps)
+    return soft
 
 
 def give_way(rows: Array, response: Array) -> Array:

@@ -19,6 +19,7 @@ state and for every step, also where Coriolis forces or an unstable equilibrium 
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import mujoco
@@ -30,7 +31,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import factor_inverse, flags, native
+from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response, native
 
 Array = NDArray[np.float64]
 
@@ -164,9 +165,13 @@ class Dynamic:
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
-        both, loose = (self.simulated, self.finer), flags("CONSTRAINT")
-        self._native = {steps: self.describe(steps, self.flags) for steps in both}
-        self._loose = {steps: self.describe(steps, loose) for steps in both} if model.neq else self._native
+        self._native = {steps: self.describe(steps, self.flags) for steps in (self.simulated, self.finer)}
+
+    @cached_property
+    def _loose(self) -> dict[Steps, _mujoco.Motion]:
+        """Steps without constraints: implicit, as stiff drives that nothing holds may overshoot else."""
+        integrator = _DISCRETE if self.steps.integrator == _DISCRETE else _IMPLICIT
+        return {steps: self.describe(Steps(steps.count, integrator), flags("CONSTRAINT")) for steps in self._native}
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
@@ -186,14 +191,14 @@ class Dynamic:
         return read
 
     def find_secants(self, read: Linearised, places: Places, states: Array, x: Array) -> Linearised:
-        """Add lines nearest to both ends of ranges, for actuators whose force is not linear in the control.
+        """Add lines nearest to ends and middles of ranges, for actuators whose force is not linear in the control.
 
         The states are those of MuJoCo and of the system, (n, n_x).
         """
         ctrl = read.nominal + x[:, : self.model.nv] @ self.moment.T
         secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
         for k, i in enumerate(self.actuators.curved):
-            ends = self.actuators.range[:, i, None] - ctrl[:, i]
+            ends = np.concatenate([part * (self.actuators.range[:, i, None] - ctrl[:, i]) for part in (0.5, 1.0)])
             for end in ends:
                 other = ctrl.copy()
                 other[:, i] += end
@@ -234,17 +239,23 @@ class Dynamic:
         nv, h = self.model.nv, self.seconds / self.simulated.count
         if self.simulated.integrator == _DISCRETE:
             return np.zeros(len(read.A), dtype=bool)
+        inverse_mass, brakes = read.inverse_mass, self.actuators.brakes
         stiff, damped = read.A[:, nv : 2 * nv, :nv], read.A[:, nv : 2 * nv, nv : 2 * nv] - np.eye(nv)
+        # Drives at a limit of their force, which overshoot without growing, have no derivative.
+        both = [(stiff, damped), (0 * stiff, -inverse_mass * brakes)][: 1 + brakes.any()]
         # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
         g = _GROWS ** (1 / self.simulated.count)
         most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
-        rates = h * damped + 0.5 * h * h * stiff
-        if self.simulated.integrator != _RK4:
-            implicit = -damped if self.simulated.integrator != _EULER else read.inverse_mass * self.damping
-            rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
-        found = np.einsum("nij,nji->n", rates, rates) > most**2  # the sum of squares of the eigenvalues
-        found[found] = np.linalg.eigvals(rates[found]).real.min(-1, initial=0.0) < -most
-        return found
+        unstable = np.zeros(len(read.A), dtype=bool)
+        for stiff, damped in both:
+            rates = h * damped + 0.5 * h * h * stiff
+            if self.simulated.integrator != _RK4:
+                implicit = -damped if self.simulated.integrator != _EULER else inverse_mass * self.damping
+                rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
+            found = np.einsum("nij,nji->n", rates, rates) > most**2  # the sum of squares of the eigenvalues
+            found[found] = np.linalg.eigvals(rates[found]).real.min(-1, initial=0.0) < -most
+            unstable |= found
+        return unstable
 
     def describe(self, steps: Steps, disabled: int) -> _mujoco.Motion:
         """Describe for the compiled part how the motion is simulated and linearised, and what balances actuators.
@@ -280,9 +291,6 @@ class Dynamic:
         nv, h, n_x = self.model.nv, self.seconds, x.shape[1]
         velocity = x[:, nv : 2 * nv]
         rates, B = read.A[:, nv:] - np.eye(n_x)[nv:], read.B[:, nv:]
-        # With ν = 0, ζ = 0 and u = ū.
-        load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
-        forces = np.concatenate([rates, B, load[:, :, None]], -1)
         inverse_mass, factor = read.inverse_mass, factor_inverse(read.inverse_mass)
         mass = (of_mass := np.linalg.inv(factor)).swapaxes(-1, -2) @ of_mass
         heavier, drag = mass, np.zeros_like(mass)
@@ -293,9 +301,13 @@ class Dynamic:
             factor = np.linalg.solve(held_by, factor.swapaxes(-1, -2)).swapaxes(-1, -2)
             inverse_mass = factor @ factor.swapaxes(-1, -2)
             drag = equality.force @ (equality.damping[:, :, None] * equality.normal)
+            rates[:, :nv, :nv] -= equality.push(rates[:, :nv, :nv], factor)
+        # With ν = 0, ζ = 0 and u = ū.
+        load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
+        forces = np.concatenate([rates, B, load[:, :, None]], -1)
         slow = -heavier @ rates[:, :nv, nv : 2 * nv] - drag
         damping = np.diag(self.damping) if self.steps.integrator == _EULER else slow
-        response = _implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+        response = implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         held = heavier if self.steps.integrator == _DISCRETE else mass
         step = self._steps(held, forces, damping, self.steps, factor)
@@ -335,7 +347,7 @@ class Dynamic:
             rates, one[:] = forces[:, :nv].copy(), np.eye(of)
             if steps.integrator == _DISCRETE:  # at the position after the step
                 rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
-                response = _implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+                response = implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
             else:
                 one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ rates)
@@ -486,15 +498,3 @@ def _reached(step: Array, velocity: Array) -> Array:
     """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""
     nv = velocity.shape[1]
     return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]
-
-
-def _implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
-    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly.
-
-    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, as M itself has lost the lightest bodies to rounding where some are
-    10¹⁰ times as heavy.
-    """
-    scaled = -h * np.linalg.solve(factor, (D + h * K) @ factor)
-    size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
-    directions = factor @ directions
-    return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)

@@ -63,6 +63,7 @@ def copy_taken(into: Any, data: Any) -> None:
         getattr(into, name)[:] = getattr(data, name)
 
 
+Array = NDArray[np.float64]
 _KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text in _WARNINGS.items()}
 
 
@@ -94,7 +95,7 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
     raise InvalidInputError(f"{text.format(**size)} ({where})") from said
 
 
-def factor_inverse(inverse_mass: NDArray[np.float64]) -> NDArray[np.float64]:
+def factor_inverse(inverse_mass: Array) -> Array:
     """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
 
     Raises:
@@ -107,3 +108,15 @@ def factor_inverse(inverse_mass: NDArray[np.float64]) -> NDArray[np.float64]:
             "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
             "make the lightest bodies heavier, or add armature to their joints"
         ) from None
+
+
+def implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
+    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly.
+
+    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, as M itself has lost the lightest bodies to rounding where some are
+    10¹⁰ times as heavy.
+    """
+    scaled = -h * np.linalg.solve(factor, (D + h * K) @ factor)
+    size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
+    directions = factor @ directions
+    return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)

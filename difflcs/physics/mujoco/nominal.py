@@ -382,7 +382,8 @@ def _compute_carried(
     """
     nv, slides = step.place.shape[1], slide.any(-1)
     tangents = np.moveaxis(contacts.tangent, 2, 0) * (closing & ~slides & (contacts.friction > 0))[:, :, None]
-    normals = contacts.normal * closing[:, :, None]
+    # What touches without a load may have one with another action.
+    normals = contacts.normal * (closing | (contacts.gap < 0))[:, :, None]
     forces = normals - _compute_drag(step, contacts, slide) * closing[:, :, None] if slides.any() else normals
     rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), step.tree) for v in (normals, forces))
     some = rows.any((0, 2))
