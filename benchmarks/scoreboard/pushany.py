@@ -73,13 +73,6 @@ class Played(NamedTuple):
     displaced: NDArray[np.float64]
 
 
-def play_seed(env: StateEnv, policy: PushAnyPolicy, seed: int, limit: int) -> Played:
-    """Play an episode; what moves because bodies overlap at the start does not count as displaced."""
-    settled = env.settled(seed)
-    episode = play(env, policy, seed, Variant(), limit)
-    return Played(episode, env.within_reach, np.linalg.norm(env.others - settled, axis=1))
-
-
 def figures(played: list[Played]) -> dict[str, Any]:
     """Compute the figures of episodes."""
     success, steps, _, milliseconds, _ = np.array([one.episode for one in played], float).T
@@ -109,7 +102,11 @@ def main(o: Options) -> None:
     for name in names:
         env = StateEnv(object_name=name)
         policy, limit = PushAnyPolicy(env, o.beyond, learned=o.learned, blind=o.blind), 5 if o.smoke else STEPS
-        played = [play_seed(env, policy, seed, limit) for seed in find_seeds(o)]
+        played: list[Played] = []
+        for seed in find_seeds(o):
+            settled = env.settled(seed)  # what moves because bodies overlap at the start is not displaced
+            episode = play(env, policy, seed, Variant(), limit)
+            played.append(Played(episode, env.within_reach, np.linalg.norm(env.others - settled, axis=1)))
         everything += played
         if not o.json:
             report(name, figures(played))

@@ -39,12 +39,6 @@ class Primitive:
         return c * h, -s * h, c * h, s * h
 
     @property
-    def mujoco_size(self) -> tuple[float, float, float]:
-        """The size, padded with zeros."""
-        a, b, c = (*self.size, 0.0, 0.0, 0.0)[:3]
-        return a, b, c
-
-    @property
     def volume(self) -> float:
         """Volume [m^3]."""
         if self.shape == "box":

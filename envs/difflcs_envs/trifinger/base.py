@@ -12,7 +12,7 @@ from difflcs_envs.checks import checked_array, checked_integer, checked_number
 from difflcs_envs.errors import MissingDependencyError, RenderingError
 from difflcs_envs.rendering import SceneViewer, has_display, select_gl_backend
 from difflcs_envs.trifinger.arguments import checked_task
-from difflcs_envs.trifinger.task import ACTION_LIMIT, EPISODE_STEPS, GOAL_SIZE, MoveTask
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask
 
 select_gl_backend()  # before the first import of MuJoCo
 try:
@@ -29,7 +29,6 @@ try:
         GOAL_MEANING,
         STATE_MEANING,
         continued,
-        make_action_space,
         make_observation_space,
         unwrap,
     )
@@ -120,7 +119,7 @@ class TriFingerEnv(GoalEnv):
         self.width = checked_integer("width", width)
         self.height = checked_integer("height", height)
 
-        self.action_space = make_action_space()
+        self.action_space = gymnasium.spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,), dtype=np.float64)
         seconds = self.horizon * CONTROL_PERIOD if self.observe_time else None
         self.observation_space = make_observation_space(task.goal_high, seconds)  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -172,7 +172,7 @@ class StandInObject(SceneObject):
                 type=getattr(mujoco.mjtGeom, f"mjGEOM_{primitive.shape.upper()}"),
                 pos=(np.array(primitive.center) - origin).tolist(),
                 quat=[w, x, y, z],
-                size=[s + margin if s else 0.0 for s in primitive.mujoco_size],
+                size=[*(s + margin for s in primitive.size), 0.0, 0.0][:3],
                 **keywords,
             )
 

@@ -6,7 +6,6 @@ import numpy as np
 from gymnasium import spaces
 
 from difflcs_envs.trifinger.physics import STATE_SIZE, WORKSPACE_RADIUS
-from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE
 
 ACTION_MEANING = "[tip 0 x, y, tip 1 x, y, tip 2 x, y] in m"
 STATE_MEANING = "[object x, y, yaw, tip 0 x, y, tip 1 x, y, tip 2 x, y] in m and rad"
@@ -14,11 +13,6 @@ GOAL_MEANING = "[x, y, yaw] of the goal in m, m, rad"
 MIN_GOAL_BOUND = 1e-3  # Gymnasium wants spaces of some extent even where a goal is fixed (turning: x and y)
 # Bound of the observed yaw [rad]: four turns either way. One action turns a cube by a third of a radian at most.
 YAW_LIMIT = 8 * math.pi
-
-
-def make_action_space() -> spaces.Box:
-    """Make the space of the displacements of all fingertips [m]."""
-    return spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,), dtype=np.float64)
 
 
 def make_observation_space(goal_high: tuple[float, float, float], seconds: float | None) -> spaces.Dict:
