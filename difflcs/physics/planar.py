@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from difflcs._checks import (
+    broadcast_batch,
     check_array,
     check_choice,
     check_kind,
@@ -135,6 +136,7 @@ class PDDrive(Drive):
 
     def _until(self, substeps: int) -> DriveStep:
         kp, kv = _number("stiffness", self.stiffness, 0.0), _number("damping", self.damping, 0.0)
+        broadcast_batch([("stiffness", kp.shape), ("damping", kv.shape)])
         kp, kv = torch.broadcast_tensors(kp, kv)
         h = check_number("substep", self.substep, strict=True)
         one, zero = torch.ones_like(kp), torch.zeros_like(kp)
@@ -172,6 +174,7 @@ class ForceDrive(Drive):
     def step(self) -> DriveStep:
         """See `Drive`."""
         mass, damping = _number("mass", self.mass, 0.0, True), _number("damping", self.damping, 0.0)
+        broadcast_batch([("mass", mass.shape), ("damping", damping.shape)])
         mass, damping = torch.broadcast_tensors(mass, damping)
         h = check_number("seconds", self.seconds, strict=True)
         decay = torch.exp(-damping * h)

@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_list, check_number, check_shape, takes
+from difflcs._checks import check_kind, check_list, check_number, check_positive_int, check_shape, takes
 from difflcs.constraints import LinearConstraints
 from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
@@ -119,7 +119,8 @@ class Obstacles:
 
     def waypoints(self, distance: float, n_points: int) -> Tensor:
         """Place points (n, 2) round each obstacle at a distance [length]."""
-        points = []
+        distance, points = check_number("distance", distance, strict=True), []
+        check_positive_int("n_points", n_points)
         for shape, pose in zip(self.shapes, self.poses, strict=True):
             key = shape, distance, n_points
             if key not in self._rings:

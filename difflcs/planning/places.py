@@ -1,5 +1,6 @@
 """Candidate places of the end effectors, in coordinates of the body, and the corresponding states."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -83,6 +84,7 @@ class Workspace:
     @takes(points="... 2")
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
         """Return a mask (...), True for points (..., 2) that are inside and `margin` away from the border [length]."""
+        margin = check_number("margin", margin, -math.inf)
         low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin
         return ((points >= low) & (points <= high)).all(-1)
 

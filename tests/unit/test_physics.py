@@ -529,6 +529,7 @@ def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_g
      ({"drive": PDDrive(1.0, -2.0, 0.1, 3)}, InvalidInputError, "damping: expected numbers of at least 0"),
      ({"drive": PDDrive(1.0, 2.0, 0.1, -3)}, InvalidInputError, "substeps: expected at least 1"),
      ({"drive": PDDrive(torch.ones(3).double(), 2.0, 0.1, 3)}, ShapeError, r"drive: expected .*\(3,\)"),
+     ({"drive": ForceDrive([1.0, 2.0], 0.1, [1.0] * 3)}, ShapeError, r"damping: its batch dimensions \(3,\)"),
      ({"inertia": Inertia(tensor([1.0, 2.0]), 0.1)}, ShapeError, "mass: expected a number"),
      ({"radius": -0.1}, InvalidInputError, "radius: expected numbers of at least 0"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, PlanarTravel, Workspace
@@ -111,6 +111,7 @@ def test_a_workspace_that_is_none_is_refused():
     refuse(InvalidInputError, "low", Workspace, (0.0, 1.0), (1.0, 1.0), step=0.1)
     refuse(ShapeError, "high", Workspace, (0.0, 0.0), (1.0,), step=0.1)
     refuse(InvalidInputError, "step", Workspace, (0.0, 0.0), (1.0, 1.0), step=0.0)
+    refuse(DTypeError, "margin", Workspace((0.0, 0.0), (1.0, 1.0), step=0.1).contains, tensor([0.5, 0.5]), "far")
 
 
 # --- travel -----------------------------------------------------------------------------------------------------------
