@@ -108,8 +108,8 @@ class Rival:
     Attributes:
         packages: those that it calls.
         origin: where a method without packages is from.
-        batches: whether one call for many problems is more than a loop.
-        differentiates: whether it computes gradients.
+        batches: whether it has `all()`, which solves all problems in one call, cold, and is more than a loop.
+        differentiates: whether it has `gradient()`, which solves all problems with their gradients.
     """
 
     packages: tuple[str, ...] = ()
@@ -133,14 +133,6 @@ class Rival:
         """Return the first action of problem i from another state, as a step of a closed loop."""
         self.problem.x0[i] = x
         return self.one(i).u[0, 0]
-
-    def all(self) -> Answer:
-        """Solve all problems in one call, cold."""
-        raise NotImplementedError
-
-    def gradient(self) -> Answer:
-        """Solve all problems with their gradients."""
-        raise NotImplementedError
 
 
 @dataclass

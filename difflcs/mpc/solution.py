@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -188,10 +188,6 @@ def _flatten(solution: MPCSolution) -> tuple[list[Tensor], _Kept]:
     return [getattr(solution, name) for name in _TENSORS], _Kept(solution.problem)
 
 
-def _unflatten(tensors: Iterable[Tensor], kept: _Kept) -> MPCSolution:
-    return MPCSolution(*tensors, of=kept.problem)
-
-
 # So that `torch.func.vmap(layer)(x0)` returns a solution.
 _TENSORS = tuple(f.name for f in fields(MPCSolution))
-register_pytree_node(MPCSolution, _flatten, _unflatten)
+register_pytree_node(MPCSolution, _flatten, lambda tensors, kept: MPCSolution(*tensors, of=kept.problem))

@@ -91,12 +91,8 @@ class Workspace:
 
 def from_body(x: Tensor, points: Tensor) -> Tensor:
     """Convert points (..., 2) from coordinates of the body whose pose begins the state x (n_x,) to the plane."""
-    return product(points, _rotation(x).mT) + x[:2]
-
-
-def _rotation(x: Tensor) -> Tensor:
     cos, sin = float(x[2].cos()), float(x[2].sin())
-    return x.new_tensor([[cos, -sin], [sin, cos]])
+    return product(points, x.new_tensor([[cos, -sin], [sin, cos]]).mT) + x[:2]
 
 
 class DiscPlaces:

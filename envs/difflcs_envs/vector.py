@@ -70,7 +70,8 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         self.num_envs = int(num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # pyright: ignore[reportAttributeAccessIssue]
-        self.threads = available_cores() if threads is None else threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.threads = cores if threads is None else threads
         self.envs = [env, *(env.sibling() for _ in range(self.num_envs - 1))]
         self.render_mode = env.render_mode
         self.single_observation_space = env.observation_space
@@ -263,13 +264,6 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
                     value = np.where(has if value.ndim == 1 else has[:, None], value, np.zeros((), value.dtype))
             result[name], result[f"_{name}"] = value, has.copy()
         return result
-
-
-def available_cores() -> int:
-    """Count the CPU cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _multiply(

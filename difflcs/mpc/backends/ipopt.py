@@ -126,7 +126,8 @@ class IpoptBackend(Backend):
         mu_init = self.mu_init_warm if warm else self.mu_init
         options = Options(self.tol, self.max_iter, mu_init, P.barrier > 0, slack, elastic)
         chunk = self._start(problem, guess, elastic)
-        workers = min(self.workers or _cpus(), problem.batch)
+        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = min(self.workers or usable, problem.batch)
         if workers <= 1:
             with _locals.here:
                 solved = solve_chunk(sizes, options, chunk)
@@ -335,11 +336,6 @@ class _Pool:
     def _replace(self, slot: int) -> None:
         self.workers[slot].close()
         self.workers[slot] = _Worker()
-
-
-def _cpus() -> int:
-    """Count the CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_pids() -> tuple[int, ...]:

@@ -18,6 +18,7 @@ from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.mujoco.native import check_readable
 
 Array = NDArray[np.float64]
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # a factor that makes it of a quaternion
 _SUFFIXES = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("_x", "_y", "_z", "_rx", "_ry", "_rz"),
     int(mujoco.mjtJoint.mjJNT_BALL): ("_rx", "_ry", "_rz"),
@@ -124,7 +125,7 @@ class MujocoState:
         for q, v in self._turning:
             there, here = reference[..., q : q + 4], _unit(qpos[..., q : q + 4])
             if (there != here).any():  # something has turned
-                x[..., v : v + 3] = _rotation_vector(_multiply(_conjugate(there), here))
+                x[..., v : v + 3] = _rotation_vector(_multiply(there * _CONJUGATE, here))
         if self.velocities:
             shape = x.shape[:-1]
             for name, values, size in (("qvel", qvel, self.nv), ("act", act, self.na)):
@@ -211,10 +212,6 @@ def _unit(q: Array) -> Array:
     size = np.sqrt((q * q).sum(-1, keepdims=True))  # sooner than np.linalg.norm
     none = size < 1e-15
     return np.where(none, np.array([1.0, 0.0, 0.0, 0.0]), q / np.where(none, 1.0, size))
-
-
-def _conjugate(q: Array) -> Array:
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _multiply(a: Array, b: Array) -> Array:
