@@ -276,11 +276,15 @@ class LCSModel(PredictiveModule):
         return model
 
     def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
-        """Write `model.safetensors` and `config.json` into a directory, atomically (created if needed).
+        """Write `model.safetensors` and `config.json` into a directory, atomically; what is there is replaced.
 
         For a model that `torch.nn.utils` has parametrised, pruned or normalised, the resulting matrices are written.
+
+        Raises:
+            InvalidInputError: the directory cannot be made or written.
         """
-        _storage.save_record(Path(directory), self.kind, self.config(), plain_state(self))
+        with _storage.place_to_write(Path(directory), "directory"):
+            _storage.save_record(Path(directory), self.kind, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str]) -> Self:

@@ -180,7 +180,7 @@ class ScaledLCS(PredictiveModule):
         return self.scales.params(inner)
 
     def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
-        """Write the `LCSModel` within and its scales into a directory, atomically (created if needed).
+        """Write the `LCSModel` within and its scales into a directory, as `LCSModel.save_pretrained` does.
 
         Raises:
             DTypeError: the module within is no `LCSModel`; save its `state_dict` and the scales yourself.
@@ -189,7 +189,8 @@ class ScaledLCS(PredictiveModule):
         tensors = {f"scales.{name}": getattr(self.scales, name) for name in ("center", "state", "action")}
         tensors |= {f"lcs.{name}": value for name, value in plain_state(lcs).items()}
         numbers = {"xi": self.scales.xi, "relaxation": self.scales.relaxation}
-        _storage.save_record(Path(directory), "ScaledLCS", {"lcs": lcs.config(), **numbers}, tensors)
+        with _storage.place_to_write(Path(directory), "directory"):
+            _storage.save_record(Path(directory), "ScaledLCS", {"lcs": lcs.config(), **numbers}, tensors)
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike[str]) -> ScaledLCS:

@@ -48,7 +48,7 @@ _CONVERGED, _DEGENERATE = int(Status.CONVERGED), int(Status.DEGENERATE)
 
 _ADVICE = {
     Status.CONVERGED: "the solution meets the tolerance",
-    Status.MAX_ITER: "the iteration limit was reached: raise max_iter, pass a guess, or check the scale of the inputs",
+    Status.MAX_ITER: "iterations or time ran out: raise max_iter or time_limit, pass a guess, or scale the inputs",
     Status.INFEASIBLE: "no plan that meets the constraints was found: see `violation`, and give some a weight",
     Status.NUMERICAL: "the numbers broke down: check the scale of the inputs and the conditioning of F",
     Status.DEGENERATE: "solved, but not classically differentiable there: its gradient is one of several valid ones",

@@ -30,7 +30,7 @@ def export_controller(
 
     Args:
         mpc: the layer, with backend `batched`; nothing in it has a batch dimension.
-        out: directory to write `controller.difflcs` and `controller.json` into, each atomically; made if needed.
+        out: directory for `controller.difflcs` and `controller.json`, made if needed; what is there is replaced.
         step_seconds: time from one step to the next [s]; 0 if that is not known.
         about: further entries of `controller.json`, in JSON types.
 

@@ -72,6 +72,7 @@ def test_an_action_support_is_saved_and_can_be_taken_away(tmp_path):
     model = LCSModel(4, 2, 3, action_support=SUPPORT)
     assert "action_support" not in dict(model.named_parameters())
     model.save_pretrained(tmp_path / "model")
+    refuse(InvalidInputError, "expected a place to write", model.save_pretrained, tmp_path / "model" / "config.json")
     assert torch.equal(LCSModel.from_pretrained(tmp_path / "model").action_support, SUPPORT)
     assert torch.equal(copy.deepcopy(model).action_support, SUPPORT)
     assert model.float().action_support.dtype == torch.float32

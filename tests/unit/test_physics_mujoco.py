@@ -338,7 +338,7 @@ def test_a_servo_with_a_constant_force_goes_where_it_is_told(bias):
 def test_an_actuator_is_a_servo_only_by_an_affine_bias():
     rest = '<actuator><general joint="px" gainprm="400" biastype="none" biasprm="0 -400 -40"/></actuator>'
     module = MujocoLCS(load(PUSHER.format(tip=""), rest), motion="dynamic")
-    torch.testing.assert_close(module.control(tensor(0.3, 0.0, 0.0, 0.0), tensor(0.05)), tensor(0.05))
+    torch.testing.assert_close(module.control(np.array([0.3, 0.0, 0.0, 0.0]), np.array([0.05])), tensor(0.05))
 
 
 def test_forces_in_the_data_act_in_dynamic_motion_alone():

@@ -71,7 +71,7 @@ def test_an_environment_that_would_clip_what_is_planned_is_refused(change, messa
     make_task(u_max=U_MAX / 2).make_envs(2).close()  # narrower ones are executed as planned
 
 
-def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
+def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path, monkeypatch):
 
     class Drawn(Slide):
         def render(self):
@@ -91,6 +91,11 @@ def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
     policy = Counted()
     record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY)
     assert policy.steps == [STEPS] * 3
+    monkeypatch.setattr("pathlib.Path.read_bytes", lambda path: b"cut")  # as where a disk is full
+    with pytest.raises(OSError, match="no room"):
+        record_video(Drawn(), policy, [(0.1,)], tmp_path / "film.mp4", TOY)
+    record_video(Drawn(), policy, [(0.1,)], tmp_path / "film.gif", TOY)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_the_cost_of_the_mpc_may_be_asked_for(build):

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from difflcs import _checks
 from difflcs._checks import check_array, check_choice, check_kind, check_number, check_positive_int, check_tensor
 from difflcs.errors import InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
@@ -273,13 +274,11 @@ class MujocoLCS:
         return None if self._whole is None else self._whole.follow(self._places, self.state, self.control, x, u)
 
     def contacts(self, x: Tensor) -> Contacts:
-        """Compute the gaps and their derivatives at states x (..., n_x).
-
-        Contacts that are missing have a gap of `distance`, and zeros.
-        """
+        """Compute gaps and their derivatives at states x (..., n_x); a missing contact has `distance` and zeros."""
         read = self._read(x)
         return Contacts(*map(torch.from_numpy, read.contacts(read.dof_contacts)))
 
+    @_checks.takes_arrays
     def control(self, x: Tensor, u: Tensor) -> Tensor:
         """Convert to MuJoCo's `ctrl` (..., nu) actions u (..., n_u) at states x (..., n_x).
 

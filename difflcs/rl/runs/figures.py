@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -186,13 +187,14 @@ def record_video(
             raise InvalidInputError(f"goal: expected {low} <= goal <= {high}, got {goal.tolist()}")
     path.parent.mkdir(parents=True, exist_ok=True)
     kind, seconds = path.suffix.lower(), task.step_seconds
-    gif = {"duration": 1000 * seconds, "loop": 0}
+    gif = {"duration": 1000 * seconds, "loop": 0, "format": "GIF"}
     options = gif if kind == ".gif" else {"fps": max(1, round(1 / seconds)), "quality": 8}
     temporary = path.with_name(f".{path.stem}.tmp{kind}")
+    target = io.BytesIO() if kind == ".gif" else temporary
     reached: list[bool] = []
     temporary.touch()  # says here whether it can be written, where the message is not one of ffmpeg
     try:
-        with cast(Any, imageio.get_writer)(temporary, **options) as video:
+        with cast(Any, imageio.get_writer)(target, **options) as video:
             for number, goal in enumerate(chosen, 1):
                 act = mpc_actions(policy)  # which begins anew, as in an evaluation
                 observation, info = env.reset(seed=seed + number, options={"goal": goal})
@@ -212,6 +214,10 @@ def record_video(
                 for _ in range(round(1.0 / task.step_seconds)):
                     video.append_data(picture)
                 reached.append(bool(info["success"]))
+        if isinstance(target, io.BytesIO):
+            temporary.write_bytes(target.getvalue())
+        elif kind == ".mp4" and b"moov" not in temporary.read_bytes():  # the index, which comes last
+            raise OSError("no room for the whole film, of which ffmpeg itself says nothing")
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
