@@ -6,6 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from difflcs._checks import check_shape
+
 __all__ = ["Frame", "find_frame"]
 
 Pair = tuple[int, int]
@@ -49,7 +51,13 @@ def find_frame(x: Tensor, u: Tensor, x_next: Tensor) -> Frame | None:
 
     Returns:
         The frame, or None if there is none, or the transitions do not tell it.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
     """
+    sizes = {"N": len(check_shape("x", x, "N n_x")), "n_x": x.shape[1]}
+    check_shape("u", u, "N n_u", sizes)
+    check_shape("x_next", x_next, "N n_x", sizes)
     x, u, change = x[-_NEWEST:], u[-_NEWEST:], (x_next - x)[-_NEWEST:]
     gain = torch.corrcoef(torch.cat([u, change], -1).mT)[: u.shape[1], u.shape[1] :].nan_to_num()
     drive = {int(row.abs().argmax()): a for a, row in enumerate(gain) if float(row.square().max()) > _DRIVEN}

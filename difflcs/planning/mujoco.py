@@ -57,7 +57,11 @@ class BodyPlaces:
         height: float | None = None,
     ):
         names = check_list("effectors", effectors, "name bodies, sites or geoms")
-        self._cost = MujocoCost(module, [Position(name) for name in names])
+        try:
+            self._cost = MujocoCost(module, [Position(name) for name in names])
+        except InvalidInputError as error:
+            text = str(error).replace("terms[", "effectors[").replace("] Position", "]")
+            raise type(error)(text) from None
         self.module, self.n_places = module, check_positive_int("n_places", n_places)
         self.n_x, self.n_effectors, self.n_place = module.n_x, len(names), 3 * len(names)
         self.gap = 0.1 * module.length if gap is None else check_number("gap", gap, strict=True)
@@ -116,17 +120,23 @@ class BodyPlaces:
         states[:, nv : 2 * nv] = 0.0
         return self._cost.reach(states, points.flatten(1), self.joints)
 
+    @takes(states="... n_x")
     def gaps(self, states: Tensor, of: Sequence[int] | None = None) -> Tensor:
         """Return the smallest gap (...) of the robot at states (..., n_x) [m], with what these columns move, if any."""
+        for i, column in enumerate([] if of is None else check_list("of", of, "give columns of positions")):
+            check_positive_int(f"of[{i}]", column, 0, self.module.state.nv - 1)
         qpos = self.module.state.to_mujoco(states)[0]
         contacts = self.module._finder.find(qpos.reshape(-1, qpos.shape[-1]))
         counts = (contacts.normal[..., self._columns] != 0).any(-1)
         if of is not None:
-            counts &= (contacts.normal[..., of] != 0).any(-1)
+            counts &= (contacts.normal[..., [*of]] != 0).any(-1)
         return torch.from_numpy(np.where(counts, contacts.gap, np.inf).min(-1)).reshape(states.shape[:-1])
 
+    @takes(x="n_x")
     def ring(self, x: Tensor, effector: int, gap: float) -> Tensor:
         """Return points (n, n_effectors, 3), one of which goes round the body at a gap, at a state x (n_x,)."""
+        check_positive_int("effector", effector, 0, self.n_effectors - 1)
+        gap = check_number("gap", gap, strict=True)
         turn, points = self._pose(x)[1].numpy(), self.points(x)
         tip, data, model, pairs = points[effector].numpy(), self._data, self._model, self._pairs[effector]
         middle, start = data.xipos[self._body].copy(), data.geom_xpos.copy()

@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from difflcs.errors import ShapeError
 from difflcs.physics import PlanarPushing, box, find_frame
+from tests.conftest import refuse
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +47,4 @@ def test_without_a_body_on_a_plane_there_is_none(pushes, build):
     noise = (build.normal(k)(100, n) for k, n in enumerate((8, 4, 8)))
     for transitions in ((x, u, stirred), (x * degrees, u, x_next * degrees), few, no_pose, (x, u, x), noise):
         assert find_frame(*transitions) is None
+    refuse(ShapeError, r"u: expected shape \(N=.*, n_u\), got", find_frame, x, u[1:], x_next)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs.errors import InvalidInputError
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.mujoco import MujocoLCS
 from difflcs.planning.mujoco import BodyPlaces, BodyTravel, Rehearsal
 from tests.conftest import refuse
@@ -54,6 +54,12 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
     assert travel.arrived(x, target)
     refuse(InvalidInputError, "effectors: expected", BodyPlaces, module, "box", ["box"])
     refuse(InvalidInputError, "may touch the body None", BodyPlaces, module, None, ["tip"])
+    refuse(
+        InvalidInputError, r"effectors\[0\]: expected a .*'tap' \(did you mean tip", BodyPlaces, module, "box", ["tap"]
+    )
+    refuse(ShapeError, "states: expected", places.gaps, x[:2])
+    refuse(InvalidInputError, r"of\[0\]: expected at most", places.gaps, x, [99])
+    refuse(InvalidInputError, "effector: expected at most 0, got 1", places.ring, x, 1, 0.1)
 
 
 @pytest.mark.parametrize(

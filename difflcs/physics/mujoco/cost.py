@@ -240,7 +240,7 @@ class MujocoCost(TensorFields):
             np.where(limited, model.jnt_range[numbers] + [margin, -margin], [-np.inf, np.inf])
         ).T
         most = torch.from_numpy(np.where(turns, _TURN_STEP, np.inf))
-        for _ in range(_STEPS if columns else 0):
+        for _ in range(_STEPS if columns and x.numel() else 0):
             near, at = self.at(x, goal), x[..., columns]
             slope = ((near.Q @ x.unsqueeze(-1)).squeeze(-1) + near.q)[..., columns]
             curve = near.Q[..., columns, :][..., columns]
