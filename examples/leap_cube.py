@@ -11,7 +11,7 @@ Our policy is a contact MPC: a quasi-dynamic system and a cost in task space, bo
 ten times a second. Its plan at several paces, what is left of the last way, and a few variations of the best of these
 are rehearsed for half a second in the model with which Judo plans, in steps of 5 ms; the best one is begun. No data.
 
-With `--spin 1` or `--spin -1` the goal runs ahead of the cube about the vertical: where less than 0.8 rad are left, it
+With `--spin 1` or `--spin -1` the goal runs ahead of the cube about the vertical: where less than 1.2 rad are left, it
 goes on by 0.4 rad, which counts as a goal. The seed says where it begins.
 
 Times are CPU times. With `--out FILE` episodes that are in the file are not played again.
@@ -45,7 +45,7 @@ from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
 from difflcs.status import solved
 
-STEP = 0.4  # by which the goal of a spin runs on [rad]
+STEP, AHEAD = 0.4, 1.2  # by how much the goal of a spin runs on, and is ahead at least [rad]
 FINGERS = {"if": "bs px md ds", "mf": "bs px md ds", "rf": "bs px md ds", "th": "mp bs px ds"}
 
 
@@ -133,7 +133,7 @@ class Episode:
 
     def __init__(self, make_task: Any, seed: int, spin: int = 0):
         self.goals, self.drops, self.random = -1, -1, np.random.RandomState(seed).get_state()
-        self.spin, self.first = spin, STEP * (2 + np.random.RandomState(seed).rand())
+        self.spin, self.first = spin, AHEAD + STEP * np.random.RandomState(seed).rand()
         self.task = make_task()
         self.draw, self.lay = self.task._update_goal_quat, self.task.reset
         self.task._update_goal_quat, self.task.reset = self.next_goal, self.reset
@@ -165,7 +165,7 @@ class Episode:
         self.task.data.ctrl[:] = ctrl
         mujoco.mj_step(self.task.sim_model, self.task.data)
         self.task.post_sim_step()
-        if self.spin and 2 * np.arccos(min(1.0, abs(float(self.task.data.qpos[3:7] @ self.task.goal_quat)))) < 2 * STEP:
+        if self.spin and 2 * np.arccos(min(1.0, abs(float(self.task.data.qpos[3:7] @ self.task.goal_quat)))) < AHEAD:
             self.next_goal()
 
 
