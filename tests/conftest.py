@@ -17,8 +17,14 @@ from torch import Tensor
 from difflcs import DiffLCSError, GoalCost, LCSModel, LCSParams, QuadraticCost
 
 # Threads cost more than they bring on problems as small as those of the tests; it is the number of the kernels', too.
-# Tests about threads say themselves how many they want.
+# Tests about threads say themselves how many they want, until they end.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    yield
+    torch.set_num_threads(1)
 
 
 def refuse(error, match: str, function: Callable, *args, **kwargs) -> str:

@@ -5,7 +5,6 @@
 
 import struct
 import zlib
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -132,10 +131,9 @@ def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_se
         )
     for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
         check_positive_int(name, value, minimum=0, maximum=_LARGEST)
-    sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}
-    n_x = problem.n_x
-    n_goal = cost.n_goal if isinstance(cost, GoalCost) else 0
-    options = {
+    numbers = {name: getattr(problem, name) for name in ("n_x", "n_u", "n_lam", "n_c", "horizon")}
+    numbers |= {
+        "n_goal": cost.n_goal if isinstance(cost, GoalCost) else 0,
         "relaxation": problem.relaxation,
         "barrier": problem.barrier,
         "tol": backend.tol,
@@ -148,22 +146,12 @@ def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_se
         "starts_guessed": backend.starts(problem, guessed=True),
         "step_seconds": step_seconds,
     }
-    numbers = {**sizes, "horizon": problem.horizon, "n_goal": n_goal, **options}
     entries: list[tuple[str, np.ndarray]] = [(name, np.array([value], np.float64)) for name, value in numbers.items()]
     entries += [(name, getattr(problem, name).numpy()) for name in INPUTS if name != "x0"]
-    for name, shape in (
-        ("goal_to_q", (n_x, n_goal)),
-        ("goal_to_q_final", (n_x, n_goal)),
-        ("goal_stage", (n_goal, n_goal)),
-        ("goal_final", (n_goal, n_goal)),
-    ):
-        value = getattr(cost, name).detach().to("cpu", torch.float64).numpy() if n_goal else np.zeros(shape)
+    for name in ("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"):
+        value = getattr(cost, name).detach().to("cpu", torch.float64).numpy() if numbers["n_goal"] else np.zeros(0)
         entries.append((name, value))
     entries.append(("constant", np.array([constant], np.float64)))
-    return _pack(entries)
-
-
-def _pack(entries: Iterable[tuple[str, np.ndarray]]) -> bytes:
     body = b"".join(
         struct.pack("<16sQ", name.encode(), value.size) + np.ascontiguousarray(value, "<f8").tobytes()
         for name, value in entries

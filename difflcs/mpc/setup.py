@@ -89,11 +89,13 @@ class Setup(NamedTuple):
             return self.limits(system)
         if self.bounds is not None:
             return self.bounds.by_steps()
-        limits = within_support(self.u_min, self.u_max, system)
-        if x0 is None:
-            return limits
+        u_min, u_max = within_support(self.u_min, self.u_max, system)
         # Matrices of a call are mostly those of the layer's module, whose actuators they do not know.
-        return within_reach(*limits, system if hasattr(system, "action_bounds") else self.lcs, x0)
+        reach = getattr(system, "action_bounds", getattr(self.lcs, "action_bounds", None))
+        if x0 is None or reach is None:
+            return u_min, u_max
+        low, high = (v.to(u_min) for v in reach(x0))
+        return u_min.clamp(low, high), u_max.clamp(low, high)
 
 
 class Call(NamedTuple):
@@ -196,15 +198,6 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
             f"was fitted to, got {u_min.tolist()} to {u_max.tolist()}; set its action_support to None"
         )
     return limits
-
-
-def within_reach(u_min: Tensor, u_max: Tensor, system: System, x0: Tensor) -> tuple[Tensor, Tensor]:
-    """Clip the bounds of the actions to what a module's actuators can do at x0, if it has `action_bounds`."""
-    action_bounds = getattr(system, "action_bounds", None)
-    if action_bounds is None:
-        return u_min, u_max
-    low, high = (v.to(u_min) for v in action_bounds(x0))
-    return u_min.clamp(low, high), u_max.clamp(low, high)
 
 
 def check_system(lcs: object) -> System:

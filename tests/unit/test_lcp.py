@@ -80,17 +80,13 @@ def test_gradient_at_a_kink_is_the_one_sided_derivative_of_the_inactive_side(bui
 @pytest.mark.parametrize("n", [1, 9, 10, 16, 64])
 def test_batch_equals_loop_bitwise_whatever_the_threads(build, relaxation, n):
     F, q = torch.stack([definite(n, s) for s in range(19)]), build.normal(n)(19, n)
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            whole = solve_lcp(F, q, relaxation=relaxation)
-            for i in range(19):
-                one = solve_lcp(F[i], q[i], relaxation=relaxation)
-                assert torch.equal(one.lam, whole.lam[i])
-                assert torch.equal(one.w, whole.w[i])
-    finally:
-        torch.set_num_threads(before)
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        whole = solve_lcp(F, q, relaxation=relaxation)
+        for i in range(19):
+            one = solve_lcp(F[i], q[i], relaxation=relaxation)
+            assert torch.equal(one.lam, whole.lam[i])
+            assert torch.equal(one.w, whole.w[i])
 
 
 def test_leading_dimensions_broadcast_and_gradients_sum_over_them(build):

@@ -9,8 +9,6 @@ from difflcs import LCSModel
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from tests.conftest import refuse
 
-NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
-
 
 @pytest.fixture
 def model(build):
@@ -24,7 +22,7 @@ def test_a_new_model_has_the_documented_start():
     }  # fmt: skip
     assert all(p.dtype == torch.float64 and p.requires_grad for p in model.parameters())
     assert torch.equal(model.c, torch.zeros(5, dtype=torch.float64))
-    for name in set(NAMES) - {"c"}:
+    for name in set(LCSModel.parameter_names) - {"c"}:
         value = getattr(model, name).detach()
         assert 0 < float(value.abs().max()) <= 1e-3
     assert not LCSModel(9, 6, 5, learn_c=False).c.requires_grad

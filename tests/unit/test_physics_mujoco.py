@@ -252,6 +252,14 @@ def tower(boxes):
     return load(floor + "".join(stacked))
 
 
+def test_geoms_that_cannot_touch_are_told_where_something_should_be_pushed():
+    model = pushing(tip='contype="0" conaffinity="0"')
+    for options in ({}, {"motion": "dynamic", "contacts": 3}, {"motion": "dynamic", "pairs": [("box", "box")]}):
+        with pytest.warns(ContactWarning, match="expected geoms that may touch, got none"):
+            MujocoLCS(model, **options)
+    assert not MujocoLCS(model, motion="dynamic").n_lam
+
+
 def test_contacts_that_have_no_room_are_warned_of_once_and_not_where_they_were_chosen():
     module = MujocoLCS(model := tower(4), motion="dynamic")
     state = module.state.to_state(model.qpos0)

@@ -198,20 +198,12 @@ class BatchedBackend(Backend):
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, ...], solved: Tensor, pivot: bool
     ) -> dict[str, Tensor]:
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
-        x, u, lam, mu, x_bar, u_bar, lam_bar, objective_bar = (array(v) for v in (*result.primal, *grads))
         _kernels.vjp_mpc(
-            inputs=problem.arrays,
-            horizon=problem.horizon,
-            relaxation=problem.relaxation,
-            barrier=problem.barrier,
-            x=x,
-            u=u,
-            lam=lam,
-            mu=mu,
-            x_bar=x_bar,
-            u_bar=u_bar,
-            lam_bar=lam_bar,
-            objective_bar=objective_bar,
+            problem.arrays,
+            problem.horizon,
+            problem.relaxation,
+            problem.barrier,
+            *(array(v) for v in (*result.primal, *grads)),
             solved=solved.to(torch.int8).numpy(),
             pivot=pivot,
             threads=self._threads(),

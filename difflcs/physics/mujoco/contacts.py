@@ -102,6 +102,7 @@ class ContactFinder:
             of the pairs can have, at most `MOST_CONTACTS`, with a `ContactWarning` where more touch.
         friction: coefficient of all; None: that of the geoms.
         torsion: False to leave out torsional friction.
+        expected: True to warn if nothing may touch; so are named pairs, and a number of contacts.
 
     Attributes:
         axis: normal (3,) of the plane in which everything moves, or None.
@@ -123,6 +124,7 @@ class ContactFinder:
         contacts: int | Sequence[Budget] | None,
         friction: float | None,
         torsion: bool,
+        expected: bool,
     ):
         self.model, self.data, self.distance = model, data, distance
         self._warn_within = _NEAR * length if contacts is None else -np.inf
@@ -133,6 +135,13 @@ class ContactFinder:
         _check_contacts(model, self.allowed, friction)
         self._margin = _margins(model) * self.allowed
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
+        asked = len(list(pairs)) > 0 if pairs is not None else expected or contacts is not None
+        if asked and not len(first):
+            warn(
+                "expected geoms that may touch, got none, so that no contact moves anything: let contype and "
+                "conaffinity of geoms fit, on bodies that move and are not fixed to each other, and enable contacts",
+                ContactWarning,
+            )
         kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
         if contacts is None:
             contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))

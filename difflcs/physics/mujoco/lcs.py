@@ -159,8 +159,9 @@ class MujocoLCS:
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
-        self._places, frictions = Places(model, self._data), (friction, torsion)
-        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
+        pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
+        more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
+        self._finder = ContactFinder(model, self._data, self._places, pairs, *more)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
             self._give = self._typical_response()
