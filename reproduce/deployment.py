@@ -5,6 +5,7 @@
 
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +85,7 @@ class Deployments(Reporter):
         """Compute the NUMBERS of one evaluation of the latest checkpoint."""
         spec: Any = get_task(self.unit.task) if protocol == "task" else self.unit.spec
         bounds = load_action_support(run) if protocol == "support" else (None, None)
-        envs = spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)
-        try:
+        with closing(spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)) as envs:
             seed, steps = self.schedule.evaluation_seed, spec.episode_steps
             evaluation = evaluate(envs, load_policy(run, spec), goals, seed, steps, *bounds)
-        finally:
-            envs.close()
         return {name: getattr(evaluation, name) for name in NUMBERS}

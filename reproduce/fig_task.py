@@ -45,14 +45,6 @@ def newest(work: Path) -> Path:
     return max(finished, key=lambda run: (finished[run]["at"].max(), finished[run].finished.max()))
 
 
-def find_model(path: Path) -> TrainedPolicy:
-    """Find a model of the cube."""
-    learned = TrainedPolicy.open(path)
-    if learned.task != "cube":
-        raise InvalidInputError(f"run: expected a model of the cube, got one of {learned.task}; pass another")
-    return learned
-
-
 def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]:
     """Run a noise-free episode; return the scene at its start, `STEPS` from above, and whether the goal was reached.
 
@@ -85,7 +77,9 @@ def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]
 def draw(options: DrawTask) -> int:
     """Train if asked for, then write the figure; return the exit code."""
     code = run(replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",)), ["curves"]) if options.rerun else 0
-    learned = find_model(newest(options.work) if options.rerun else options.run)
+    learned = TrainedPolicy.open(newest(options.work) if options.rerun else options.run)
+    if learned.task != "cube":
+        raise InvalidInputError(f"run: expected a model of the cube, got one of {learned.task}; pass another")
     scene, pictures, reached = trajectory(learned.policy)
     outcome = f"goal {'reached' if reached else 'missed'}"
     figure = Figure((11.0, 4.4), dpi=150, layout="constrained")

@@ -7,6 +7,7 @@ and figure are drawn from the tracked record; `--rerun` computes what is missing
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -102,15 +103,12 @@ def acting(condition: Condition, policy: Any, n_u: int, rng: np.random.Generator
 
 def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed: int) -> dict[str, Any]:
     """Count the goals reached and the solves that failed."""
-    envs = replace(task, env_kwargs={**task.env_kwargs, **(condition.env or {})}).make_envs(min(50, goals))
-    parts = []
-    try:
+    changed, parts = replace(task, env_kwargs={**task.env_kwargs, **(condition.env or {})}), []
+    with closing(changed.make_envs(min(50, goals))) as envs:
         for first in range(0, goals, envs.num_envs):
             seeds = episode_seeds(seed, Stream.EVALUATION, first, min(envs.num_envs, goals - first))
             act = acting(condition, policy, task.n_u, np.random.default_rng((seed, Stream.ACTION, first)))
             parts.append(collect(envs, act, seeds, task.episode_steps))
-    finally:
-        envs.close()
     reached = torch.cat([part["success"] for part in parts]).int().tolist()
     failures = sum(int(part["failures"].sum()) for part in parts)
     return {**asdict(condition), "reached": "".join(map(str, reached)), "solver_failures": failures}

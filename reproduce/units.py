@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -206,11 +207,8 @@ def schedule_of(unit: Unit, preset: Preset) -> TrainConfig:
 def describe_object(task: str) -> Mapping[str, Any]:
     """Describe the object on this machine, in JSON types: the origin of its shape, the hash of its mesh, its mass."""
     spec = get_task(task)
-    env = spec.make_env()
-    try:
+    with closing(spec.make_env()) as env:
         return spec.describe(env)
-    finally:
-        env.close()
 
 
 def key_of(unit: Unit, preset: Preset, objects: Mapping[str, Mapping[str, Any]]) -> str:

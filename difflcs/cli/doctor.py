@@ -143,11 +143,6 @@ def as_text(checks: Sequence[Check], width: int = 100) -> str:
     return "\n".join([*lines, verdict + (f"; not here: {', '.join(rest)}." if rest else ".")])
 
 
-def as_json(checks: Sequence[Check]) -> str:
-    """Format the checks and the verdict as one JSON object."""
-    return json.dumps({"ok": healthy(checks), "checks": [asdict(check) for check in checks]}, sort_keys=True)
-
-
 def _check(group: str, name: str, work: Callable[[], str], core: bool = False) -> Check:
     try:
         return Check(group, name, "ok", work(), core=core)
@@ -162,10 +157,6 @@ def _check(group: str, name: str, work: Callable[[], str], core: bool = False) -
 
 
 # --- library and solvers ----------------------------------------------------------------------------------------------
-
-
-def _hard_dependencies() -> str:
-    return ", ".join(f"{name} {import_module(name).__version__}" for name in _HARD)
 
 
 def _kernels() -> str:
@@ -340,7 +331,7 @@ def _in_process(code: str) -> dict[str, Any]:
 _LIBRARY: dict[str, Callable[[], str]] = {
     "python": lambda: f"{platform.python_version()}, {platform.system()} {platform.machine()}",
     "difflcs": lambda: difflcs.__version__,
-    "packages": _hard_dependencies,
+    "packages": lambda: ", ".join(f"{name} {import_module(name).__version__}" for name in _HARD),
     "kernels": _kernels,
     "files": _files,
     "zoo": _models,
@@ -358,6 +349,8 @@ def main(as_object: bool = False) -> int:
         Exit code: 0 if the library works, 1 if not.
     """
     checks = examine()
-    width = min(120, shutil.get_terminal_size().columns)
-    print(as_json(checks) if as_object else as_text(checks, width))
+    if as_object:
+        print(json.dumps({"ok": healthy(checks), "checks": [asdict(check) for check in checks]}, sort_keys=True))
+    else:
+        print(as_text(checks, min(120, shutil.get_terminal_size().columns)))
     return 0 if healthy(checks) else 1

@@ -4,6 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -58,15 +59,12 @@ class Evaluate:
                 )
             bounds = load_action_support(learned.run)
         start = time.perf_counter()
-        envs = task.make_envs(max(1, min(EVALUATION_ENVS, goals)))
-        description = _describe_env(learned, task, envs)
-        try:
+        with closing(task.make_envs(max(1, min(EVALUATION_ENVS, goals)))) as envs:
+            description = _describe_env(learned, task, envs)
             with bar(goals * task.episode_steps, "evaluating") as shown:
                 result = evaluate(
                     envs, learned.policy, goals, self.seed, task.episode_steps, *bounds, after_step=shown.update
                 )
-        finally:
-            envs.close()
         seconds = time.perf_counter() - start
         if self.plot is not None:
             draw_policy(learned.policy, task, self.plot, min(goals, EVALUATION_ENVS), self.seed)
@@ -240,12 +238,10 @@ def film(learned: TrainedPolicy, task: TaskSpec, goals: Sequence[Sequence[float]
         env = task.make_env(render_mode="rgb_array", **task.picture)
     except InvalidInputError as error:
         raise NoPictureError(str(error)) from error
-    try:
+    with closing(env):
         _describe_env(learned, task, env)
         with place_to_write(path):
             return record_video(env, learned.policy, goals, path, task, seed)
-    finally:
-        env.close()
 
 
 def known_versions() -> str:

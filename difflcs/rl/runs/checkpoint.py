@@ -298,16 +298,6 @@ def replace_run(out: Path) -> Iterator[Callable[[], object]]:
         RunDirectory.open(out).config()
     except CheckpointError as error:
         raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
-    with ExitStack() as held:
-        with wrap_os_errors(out):
-            held.enter_context(RunDirectory(out).locked())
-            aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
-            os.replace(out, aside / out.name)
-            out.mkdir()  # `--out` may be a link to it
-        yield from _moved(out, aside)
-
-
-def _moved(out: Path, aside: Path) -> Iterator[Callable[[], object]]:
     replaced = False
 
     def discard() -> None:
@@ -315,10 +305,16 @@ def _moved(out: Path, aside: Path) -> Iterator[Callable[[], object]]:
         replaced = True
         shutil.rmtree(aside, ignore_errors=True)
 
-    try:
-        yield discard
-    finally:
-        if not replaced:
-            shutil.rmtree(out, ignore_errors=True)
-            os.replace(aside / out.name, out)
-            aside.rmdir()
+    with ExitStack() as held:
+        with wrap_os_errors(out):
+            held.enter_context(RunDirectory(out).locked())
+            aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
+            os.replace(out, aside / out.name)
+            out.mkdir()  # `--out` may be a link to it
+        try:
+            yield discard
+        finally:
+            if not replaced:
+                shutil.rmtree(out, ignore_errors=True)
+                os.replace(aside / out.name, out)
+                aside.rmdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -107,12 +108,9 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
     """
     if not isinstance(policy, LCSMPCLayer) or isinstance(policy.lcs, LCSSequence):
         return []
-    envs = task.make_envs(episodes)
-    try:
+    with closing(task.make_envs(episodes)) as envs:
         seeds = episode_seeds(seed, Stream.EVALUATION, 0, episodes)
         played = collect(envs, mpc_actions(policy), seeds, task.episode_steps)
-    finally:
-        envs.close()
     data = Transitions.from_episodes(played["state"], played["action"])
     context = played[CONTEXT].repeat_interleave(task.episode_steps, 0) if CONTEXT in played.keys() else None
     judged = (episodes + 1) // 2 * task.episode_steps  # the affine system beside the model is fitted to the others

@@ -320,7 +320,7 @@ class _Training:
         from torch.utils.tensorboard import SummaryWriter
 
         config, per_minute, reporter = self.config, self.task.steps_per_minute, self.reporter
-        columns = _columns(config.method)
+        columns = list(dict.fromkeys(f.name for kind in config.method.reports for f in fields(kind)))
         with wrap_os_errors(run.path):
             run.truncate_log(-1 if fresh else trainer.iteration)
         begun = "training" if fresh else f"continuing after {trainer.env_steps / per_minute:.1f} min of data"
@@ -412,11 +412,6 @@ def count_goals_due(config: TrainConfig, previous: int, now: int, task: TaskSpec
         return config.final_goals
     due = any(previous < minute * task.steps_per_minute <= now for minute in config.evaluate_at)
     return config.evaluate_goals if due else 0
-
-
-def _columns(method: Method) -> list[str]:
-    """Return the columns of log.csv: the fields of the method's reports, each once."""
-    return list(dict.fromkeys(f.name for report in method.reports for f in fields(report)))
 
 
 def _row(
