@@ -8,7 +8,7 @@ import torch
 from gymnasium import spaces
 from tensordict import TensorDict
 
-from difflcs.errors import InvalidInputError
+from difflcs.errors import DiffLCSWarning, InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
@@ -157,8 +157,16 @@ def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):
     assert taken == [3, 2, 2]
 
 
-def test_unstable_episodes_are_not_learned_from():
-    rollouts, real = make_rollouts(), episodes()
-    real["stable"] = torch.tensor([True, False, True, True, False, True])
-    rollouts.add(real)
-    assert torch.equal(rollouts.episodes["state"], real["state"][real["stable"]])
+def test_unstable_episodes_are_not_learned_from_and_another_outcome_is_told():
+    models = ModelRollouts(SPACES, lambda x, *_: (x[:, 0], x[:, 0] < 9), small(), 0, STEPS)
+    real, yes, stable = (
+        episodes(),
+        torch.ones(6, dtype=torch.bool),
+        torch.tensor([True, False, True, True, False, True]),
+    )
+    real = TensorDict({**real, "reward": real["state"][:, :-1, 0], "success": yes, "stable": stable}, [6])
+    models.add(real)  # a warning would be an error
+    assert torch.equal(models.episodes["state"], real["state"][stable])
+    for name, other in ("reward", real["reward"] + 1), ("success", ~yes):
+        with pytest.warns(DiffLCSWarning, match="another task"):
+            models.add(TensorDict({**real, name: other}, [6]))

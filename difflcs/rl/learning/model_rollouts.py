@@ -7,6 +7,7 @@ computing time instead.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from difflcs._checks import check_positive_int
-from difflcs.errors import InvalidInputError
+from difflcs.errors import DiffLCSWarning, InvalidInputError
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.rollout import (
@@ -221,6 +222,22 @@ class ModelRollouts:
     def add(self, episodes: TensorDict) -> None:
         """Add the stable ones among real episodes, a record of `difflcs.rl.collect` or of `TRANSITIONS`."""
         self.episodes = append_episodes(self.episodes, episodes)
+        if self.fits < 2 and "reward" in episodes.keys():
+            self._compare(episodes[episodes["stable"]])
+
+    def _compare(self, real: Any) -> None:
+        """Warn if the outcome is not that of the environment in real episodes: networks would teach another task."""
+        steps = real["reward"].shape[1]
+        ended = torch.arange(1, steps + 1).repeat(len(real)) == steps
+        parts = (real["state"][:, :-1], real["action"], real["state"][:, 1:])
+        before, action, after = (part.flatten(0, 1) for part in parts)
+        goals = real["goal"].repeat_interleave(steps, 0)
+        reward, success = self.env.outcome(before, action, after, goals, ended)
+        off = (reward - real["reward"].flatten()).abs() > 1e-3 * real["reward"].abs().max()
+        off[ended] |= success[ended] != real["success"]
+        if (share := float(off.double().mean())) > 0.01:
+            text = f"outcome: expected what env.step gives, got another reward or success in {share:.0%} of the steps"
+            warnings.warn(f"{text}; PPO would learn another task: mend TaskSpec.outcome", DiffLCSWarning, stacklevel=2)
 
     def fit(self) -> float:
         """Fit the ensemble to all episodes, and let the environment start from them; returns the loss."""
