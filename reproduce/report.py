@@ -48,6 +48,11 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
     """Run a drawing script: compute if asked for, then draw, stand-ins apart; return the exit code."""
 
     def action(options: Draw) -> int:
+        amounts = ("seeds", "goals", "objects", "methods", "recipes", "missing")
+        if not options.rerun and (given := [amount for amount in amounts if getattr(options, amount)]):
+            raise CheckpointError(
+                f"{', '.join(given)}: expected with --rerun alone, got without; results are drawn whole"
+            )
         code = runs.run(options, [artefact]) if options.rerun else 0
         preset = options.preset or ("quick" if options.rerun else None)
         wanted = [preset] if preset else list(PRESETS)
