@@ -183,6 +183,7 @@ def run_of(out: Path) -> SimpleNamespace:
         (["evaluate", "cubee"], "did you mean cube"),
         (["zoo", "trifingercube"], "did you mean trifinger-cube"),
         (["evaluate", "nowhere"], "difflcs train"),
+        (["render", "nowhere"], "difflcs train"),
     ],
 )
 def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):

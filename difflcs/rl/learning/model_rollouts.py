@@ -30,6 +30,7 @@ from difflcs.rl.rollout import (
     episodes_to_state,
     make_empty_record,
     observed_transitions,
+    transitions,
 )
 from difflcs.rl.seeding import Stream, generator
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded, group
@@ -229,10 +230,8 @@ class ModelRollouts:
         """Warn if the outcome is not that of the environment in real episodes: networks would teach another task."""
         steps = real["reward"].shape[1]
         ended = torch.arange(1, steps + 1).repeat(len(real)) == steps
-        parts = (real["state"][:, :-1], real["action"], real["state"][:, 1:])
-        before, action, after = (part.flatten(0, 1) for part in parts)
         goals = real["goal"].repeat_interleave(steps, 0)
-        reward, success = self.env.outcome(before, action, after, goals, ended)
+        reward, success = self.env.outcome(*transitions(real), goals, ended)
         off = (reward - real["reward"].flatten()).abs() > 1e-3 * real["reward"].abs().max()
         off[ended] |= success[ended] != real["success"]
         if (share := float(off.double().mean())) > 0.01:
