@@ -33,11 +33,6 @@ def success(cells: Cells) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def pairs_of(cells: Cells) -> report.Pairs:
-    """Pair training from the cube's model with training from scratch, for each object."""
-    return {task.replace("_", " "): (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
-
-
 def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
     """Draw the curves of all objects."""
     for axes, (task, starts) in zip(figure.subplots(2, 3, sharey=True).flat, cells.items(), strict=True):
@@ -68,8 +63,9 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         used += [cell for starts in cells.values() for cell in starts.values() if cell is not None]
         label = RECIPES[recipe].label
         tables[f"LCS-RL from scratch and from the cube's model, {label}: success [%]"] = success(cells)
-        tables[f"The differences, {label}"] = report.differences("object", pairs_of(cells), WHEN)
-        found = report.verdicts(pairs_of(cells), WHEN)
+        pairs = {task.replace("_", " "): (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
+        tables[f"The differences, {label}"] = report.differences("object", pairs, WHEN)
+        found = report.verdicts(pairs, WHEN)
         said += [f"From the cube's model against from scratch, {label}, {time}: {v}." for time, v in found.items()]
         figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
         panel(figure, cells, name.endswith("stand-in"))

@@ -159,11 +159,8 @@ def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):
 
 def test_unstable_episodes_are_not_learned_from_and_another_outcome_is_told():
     models = ModelRollouts(SPACES, lambda x, *_: (x[:, 0], x[:, 0] < 9), small(), 0, STEPS)
-    real, yes, stable = (
-        episodes(),
-        torch.ones(6, dtype=torch.bool),
-        torch.tensor([True, False, True, True, False, True]),
-    )
+    real, yes = episodes(), torch.ones(6, dtype=torch.bool)
+    stable = torch.tensor([True, False, True, True, False, True])
     real = TensorDict({**real, "reward": real["state"][:, :-1, 0], "success": yes, "stable": stable}, [6])
     models.add(real)  # a warning would be an error
     assert torch.equal(models.episodes["state"], real["state"][stable])

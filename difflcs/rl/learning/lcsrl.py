@@ -41,14 +41,6 @@ class LCSRL(Trainer):
             self.current.remember(warmup.buffer)
         self.iteration, self.episodes = self.current.iteration, self.current.episodes
 
-    def _make_main_phase(self, episodes: int, iterations: int) -> PPO:
-        """Make the main phase that begins there, or return the current one if it has begun."""
-        current = self.current
-        begun = None if current is self._warmup else (current.first_episode, current.first_iteration)
-        if begun == (episodes, iterations):
-            return current
-        return self._make_main(episodes, iterations)
-
     def step(self, after_step: AfterStep | None = None) -> WarmupReport | PhysicsFitReport | PPOReport:
         """One iteration of the current phase."""
         report = self.current.step(after_step)
@@ -71,7 +63,8 @@ class LCSRL(Trainer):
             if check_choice("phase", state.get("phase"), (_WARMUP, _MAIN)) == _MAIN:
                 names = ("first_episode", "first_iteration")
                 before = [check_positive_int(name, inner["settings"][name], minimum=0) for name in names]
-                current = self._make_main_phase(*before)
+                begun = [getattr(self.current, name, None) for name in names]  # a warm-up has neither
+                current = self.current if begun == before else self._make_main(*before)
         except (InvalidInputError, KeyError, TypeError) as error:
             raise CheckpointError(
                 f"checkpoint: expected the state of a warm-up or a main phase, got {sorted(state)} ({error}); was it "
