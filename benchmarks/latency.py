@@ -53,7 +53,7 @@ class Options:
     out: Path = Path("benchmarks/results/latency.json")
     """Path of the JSON output."""
     smoke: bool = False
-    """A few calls only."""
+    """A few calls only, in a record of its own."""
 
 
 @dataclass
@@ -194,6 +194,7 @@ def main(o: Options) -> None:
     """Measure, print, write."""
     if o.smoke:
         o.episodes, o.warm_up = 2, 1
+        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DegenerateWarning)
     results = {}

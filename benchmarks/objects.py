@@ -60,7 +60,7 @@ class Options:
     out: Path = Path("benchmarks/results/objects.json")
     """Path of the JSON output."""
     smoke: bool = False
-    """Seconds instead of hours, with the methods' smoke settings; learns nothing."""
+    """Seconds instead of hours, with the methods' smoke settings, in a record of its own; learns nothing."""
 
 
 def key(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -114,6 +114,7 @@ def main(o: Options) -> None:
     """Train, evaluate, write."""
     if o.smoke:
         o.tasks, o.seeds, o.minutes, o.goals = o.tasks[:1], o.seeds[:1], [0, 0.4], 4
+        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     torch.set_num_threads(1)
     rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
     for seed in o.seeds:

@@ -46,7 +46,7 @@ class Options:
     out: Path = Path("benchmarks/results/optima.json")
     """Path of the JSON output."""
     smoke: bool = False
-    """Everything tiny."""
+    """Everything tiny, in a record of its own."""
 
 
 def solve(instance: Instance, backend: Backend) -> tuple[torch.Tensor, float]:
@@ -114,6 +114,7 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     if o.smoke:
         o.problems, o.repetitions = 4, 1
+        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     results = json.loads(o.out.read_text())["results"] if o.only and o.out.exists() else {}
     for kind, make in {**FAMILIES, **BOUNCING}.items():
         if o.only and kind not in o.only:

@@ -118,7 +118,7 @@ class Options:
     out: Path = Path("benchmarks/results/race.json")
     """Path of the JSON output."""
     smoke: bool = False
-    """Everything tiny."""
+    """Everything tiny, in a record of its own."""
 
 
 # --- environments and processes ---------------------------------------------------------------------------------------
@@ -445,6 +445,7 @@ def main(o: Options) -> None:
         return
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
+        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     torch.set_num_threads(1)
     names = ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
     options = {name: getattr(o, name) for name in names}

@@ -49,7 +49,7 @@ class Options:
     out: Path = Path("benchmarks/results/scale.json")
     """Path of the JSON output."""
     smoke: bool = False
-    """Everything tiny."""
+    """Everything tiny, in a record of its own."""
 
 
 @torch.no_grad()
@@ -84,6 +84,7 @@ def main(o: Options) -> None:
     random, carts, horizons, models, few = RANDOM, CARTS, HORIZONS, WEAK_MODELS, WEAK_PROBLEMS
     if o.smoke:
         o.problems, o.seeds, random, carts, horizons, models, few = 4, 1, random[:1], carts[:1], horizons[:1], 2, 2
+        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     rows = []
     for n_x, n_lam, horizon in random:
         systems = [random_model(n_lam, seed, n_x, n_u=2 * n_x // 3) for seed in range(o.seeds)]

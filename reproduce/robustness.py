@@ -22,6 +22,7 @@ from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
+from difflcs import _storage
 from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
 from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
@@ -127,7 +128,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
         selected = [one for one in selected if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
     new = {"options": asked, "machine": machine(), "results": []}
-    record: Any = json.loads(path.read_text()) if path.exists() else new
+    record: Any = _storage.read_json(path) if path.exists() else new
     if record["options"] != asked:
         raise CheckpointError(
             f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
@@ -197,7 +198,7 @@ def draw_record(options: Options) -> int:
         compute(options, path)
     if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
-    record: Any = json.loads(path.read_text())
+    record: Any = _storage.read_json(path)
     if record["options"]["model"] != str(options.model):
         raise CheckpointError(
             f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "

@@ -50,10 +50,6 @@ class Job:
             known = len(rows) > 0 and (rows[records.IDENTITY] == list(self.identity)).to_numpy().all()
             return rows if known and (self.folder / "run" / "config.json").is_file() else None
 
-    def keep(self, rows: pd.DataFrame) -> None:
-        """Write its result."""
-        records.write(self.folder / "result.csv", rows)
-
 
 def execute(job: Job) -> pd.DataFrame:
     """Compute a unit, continue it, or read it if it is finished; return its evaluations."""
@@ -62,7 +58,7 @@ def execute(job: Job) -> pd.DataFrame:
         rows = job.result()
         if rows is None:
             rows = _train(job)
-            job.keep(rows)
+            records.write(job.folder / "result.csv", rows)
         return rows
 
 

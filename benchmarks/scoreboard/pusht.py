@@ -163,10 +163,8 @@ def main(o: Options) -> None:
     if o.smoke:
         o.episodes = min(o.episodes, 2)
     torch.set_num_threads(1)
-    env, asked = (
-        make_env(),
-        {"episodes": o.episodes, "seed": o.seed, "smoke": o.smoke, **({"adapt": True} if o.adapt else {})},
-    )
+    env = make_env()
+    asked = {"episodes": o.episodes, "seed": o.seed, "smoke": o.smoke, **({"adapt": True} if o.adapt else {})}
     record = {"machine": machine(), "options": asked, "results": {}}
     if o.out is not None and o.out.exists():
         record = json.loads(o.out.read_text())

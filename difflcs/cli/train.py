@@ -1,5 +1,6 @@
 """The commands for training: `difflcs train`, whose flags are the settings of its method, and `difflcs demo`."""
 
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
@@ -50,7 +51,7 @@ class Train(TrainConfig):
             run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in sum_seconds(run.rows()).items() if seconds)
         print(f"time: {spent}")
-        print(f"finished: {run.path}\nevaluate it with: difflcs evaluate {run.path}")
+        print(f"finished: {run.path}\nevaluate it with: {self.program} evaluate {run.path}")
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
@@ -70,7 +71,13 @@ class Train(TrainConfig):
         """Return the advice after Ctrl-C."""
         out = self.directory(self.out)
         begun = (out / "config.json").is_file()
-        return f"continue with: difflcs train --out {out} --resume" if begun else "nothing was changed"
+        return f"continue with: {self.program} train --out {out} --resume" if begun else "nothing was changed"
+
+    @property
+    def program(self) -> str:
+        """The command line that knows the method: that of the script which has registered it, or our own."""
+        own = type(self.method).__module__.startswith("difflcs.")
+        return "difflcs" if own else f"python {sys.argv[0]}"
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

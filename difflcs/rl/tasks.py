@@ -199,6 +199,12 @@ class TaskSpec:
             if not callable(value) and not (name == "env" and isinstance(value, str)):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
         check_kind("physics", self.physics, (PhysicsSpec, type(None)), "wrap what makes the system in one")
+        for name in ("u_min", "u_max"):
+            if (shape := torch.as_tensor(getattr(self, name)).shape) not in ((), (1,), (self.n_u,)):
+                raise InvalidInputError(
+                    f"{name}: expected one number or n_u={self.n_u} of them, as the cost has actions of that size, got "
+                    f"shape {tuple(shape)}; change one of them"
+                )
         low, high = self.bounds
         if not bool((low < high).all()):
             raise InvalidInputError(f"u_min: expected u_min < u_max, got {self.u_min} and {self.u_max}; swap them")

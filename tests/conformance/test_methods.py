@@ -366,7 +366,7 @@ def test_its_configuration_survives_json(name):
 
 
 def test_lcs_rl_needs_more_data_than_its_warmup():
-    with pytest.raises(InvalidInputError, match=r"--minutes 30, or --method violation"):
+    with pytest.raises(InvalidInputError, match=r"--minutes 30, a shorter --warmup-minutes, or --method"):
         get_method("lcs-rl")().check(3.0)
     get_method("lcs-rl")().check(3.5)
 

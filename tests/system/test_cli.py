@@ -25,7 +25,7 @@ import torch
 from difflcs import LCSModel, __main__, _storage, cli
 from difflcs.cli import train as cli_train
 from difflcs.rl import get_task, task_names
-from difflcs.rl.methods import LCSRLMethod, get_method, method_names
+from difflcs.rl.methods import LCSRLMethod, ViolationMethod, get_method, method_names
 from difflcs.rl.runs import progress
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.training import TrainConfig
@@ -242,6 +242,8 @@ def test_what_a_training_shows_without_a_terminal(capsys, tmp_path):
         f"after {minutes} min of data" for minutes in ("0.0", "0.3", "0.5")
     ]
     assert f"evaluate it with: difflcs evaluate {tmp_path / 'run'}" in out
+    registered = type("Mine", (ViolationMethod,), {"__module__": "__main__"})()
+    assert cli_train.Train(method=registered).program == f"python {sys.argv[0]}"
     assert logging.getLogger("difflcs").handlers == [difflcs_handler()]
 
 

@@ -296,7 +296,7 @@ def played(broken=()):
         (job.folder / "run").mkdir(parents=True)
         (job.folder / "run" / "config.json").write_text("{}")
         (job.folder / "run" / "received").write_text(str(job.init))
-        job.keep(rows)
+        records.write(job.folder / "result.csv", rows)
         return rows
 
     return execute
@@ -371,10 +371,10 @@ def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatc
         (job.folder / "result.csv").read_text().replace(job.key, "0123456789ab"),
         (job.folder / "result.csv").read_text().replace("lcs-rl", "ppo"),
     ):
-        job.keep(rows)
+        records.write(job.folder / "result.csv", rows)
         (job.folder / "result.csv").write_text(content)
         assert job.result() is None
-    job.keep(rows)
+    records.write(job.folder / "result.csv", rows)
     (job.folder / "run" / "config.json").unlink()
     assert job.result() is None
 
@@ -574,6 +574,9 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     (tmp_path / "robustness.json").write_text(json.dumps(record))
     with pytest.raises(CheckpointError, match="expected a record of runs/mine, got one of zoo:trifinger-cube"):
         robustness.draw_record(replace(options, smoke=False, model=Path("runs/mine")))
+    (tmp_path / "robustness.json").write_text(json.dumps(record)[:-9])
+    with pytest.raises(CheckpointError, match=r"robustness\.json: expected JSON"):
+        robustness.draw_record(replace(options, smoke=False))
     (tmp_path / "robustness.json").unlink()
     with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
         robustness.draw_record(replace(options, smoke=False))

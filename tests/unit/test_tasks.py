@@ -134,6 +134,7 @@ def test_what_a_picture_says():
         ({"describe": None}, DTypeError, "describe"),
         ({"u_min": 0.2}, InvalidInputError, "u_min"),
         ({"u_min": 0.3}, InvalidInputError, "swap them"),
+        ({"u_min": (-1.0, -1.0, -1.0)}, InvalidInputError, "u_min: expected one number or n_u=1"),
         ({"u_max": float("nan")}, InvalidInputError, "u_min"),
         ({"goal": (Quantity("x", "m"), Quantity("y", "m"))}, InvalidInputError, "goal: expected 1 entries"),
         ({"example_goals": ((0.1, 0.2),)}, InvalidInputError, "example_goals: expected 1 entries"),

@@ -60,11 +60,8 @@ class Incumbent:
     """
 
     def __init__(self, best: GaussianPolicy, learner: GaussianPolicy, failure: float, errors: float, n_inputs: int):
-        self.policy, self.learned, self.learner = (
-            best.controller,
-            check_learned(best.learned),
-            check_learned(learner.learned),
-        )
+        self.policy, self.learned = best.controller, check_learned(best.learned)
+        self.learner = check_learned(learner.learned)
         self.failure, self.errors = failure, errors
         self._playing: State = {}
         self._none = (torch.zeros(0, n_inputs, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
