@@ -22,7 +22,6 @@ from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
-from difflcs import _storage
 from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
 from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
@@ -128,7 +127,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
         selected = [one for one in selected if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
     new = {"options": asked, "machine": machine(), "results": []}
-    record: Any = _storage.read_json(path) if path.exists() else new
+    record: Any = json.loads(path.read_text()) if path.exists() else new
     if record["options"] != asked:
         raise CheckpointError(
             f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
@@ -194,11 +193,14 @@ def draw_record(options: Options) -> int:
     name = "robustness-smoke" if options.smoke else "robustness"
     options = replace(options, goals=min(options.goals, 4)) if options.smoke else options
     path = options.results / f"{name}.json"
-    if options.rerun or options.smoke:
-        compute(options, path)
-    if not path.exists():
+    try:
+        if options.rerun or options.smoke:
+            compute(options, path)
+        record: Any = json.loads(path.read_text()) if path.exists() else None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path}: expected JSON, got {error}; restore it from a copy, or delete it") from error
+    if record is None:
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
-    record: Any = _storage.read_json(path)
     if record["options"]["model"] != str(options.model):
         raise CheckpointError(
             f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "
