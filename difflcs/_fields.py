@@ -11,6 +11,14 @@ from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 
+def register(module: nn.Module, name: str, value: Tensor | None, persistent: bool = True) -> None:
+    """Register a tensor of a module: an nn.Parameter as parameter, any other as buffer."""
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    else:
+        module.register_buffer(name, value, persistent=persistent)
+
+
 class TensorFields(nn.Module):
     """A module whose tensors are registered by kind: nn.Parameter as parameter, any other tensor as buffer.
 
@@ -19,12 +27,6 @@ class TensorFields(nn.Module):
     """
 
     by_stage: frozenset[str] = frozenset()
-
-    def _register(self, name: str, value: Tensor | None, persistent: bool = True) -> None:
-        if isinstance(value, nn.Parameter):
-            self.register_parameter(name, value)
-        else:
-            self.register_buffer(name, value, persistent=persistent)
 
     def _held(self, names: Iterable[str]) -> dict[str, Tensor]:
         """Return some fields by their names; faster than one attribute after the other."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_shape, describe, plain, takes_arrays
 from difflcs._differentiation import is_wrapped
-from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
+from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages, register
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError
 
 _DIMENSIONS = {"G": 2, "g": 1, "E": 2, "weight": 1}
@@ -84,7 +84,7 @@ class StageBounds(TensorFields):
         self.n_u = like.shape[-1]
         for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
             dims = [("H", self.horizon)] * (name in self.by_stage) + [("n_u", self.n_u)]
-            self._register(name, as_bound(name, none if value is None else value, dims, like), persistent=False)
+            register(self, name, as_bound(name, none if value is None else value, dims, like), persistent=False)
         check_bounds(*self.by_steps())
 
     def by_steps(self) -> tuple[Tensor, Tensor]:
@@ -124,7 +124,7 @@ class _Constraints(TensorFields):
             )
         check_constraints(fields["g"], fields.get("weight"))
         for name in _DIMENSIONS:
-            self._register(name, fields.get(name))
+            register(self, name, fields.get(name))
 
     def tensors(self) -> dict[str, Tensor]:
         """Return name in a problem → tensor: G_x, g, price, and G_u if the actions count."""

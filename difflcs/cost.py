@@ -21,7 +21,7 @@ from difflcs._checks import (
     takes_arrays,
 )
 from difflcs._differentiation import is_wrapped, runs_eagerly
-from difflcs._fields import TensorFields, check_by_stage, check_stages
+from difflcs._fields import TensorFields, check_by_stage, check_stages, register
 from difflcs._linalg import matvec, quadratic
 from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
@@ -75,7 +75,7 @@ class _Quadratic(TensorFields):
             if "S" in fields:
                 _check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
         for name in _DIMENSIONS:
-            self._register(name, fields.get(name))
+            register(self, name, fields.get(name))
 
     def _stage_hessian(self, fields: dict[str, Tensor]) -> Tensor:
         blocks = []
@@ -312,13 +312,11 @@ class GoalCost(TensorFields):
             "goal_final": square.clone() if goal_final is None else goal_final,
         }
         x, goal = ("n_x", self.n_x), ("n_goal", self.n_goal)
-        for name in ("goal_to_q", "goal_to_q_final"):
-            check_tensor(name, fields[name], [x, goal])
-        for name in ("goal_stage", "goal_final"):
-            check_tensor(name, fields[name], [goal, goal])
+        for name, rows in (("goal_to_q_final", x), ("goal_stage", goal), ("goal_final", goal)):
+            check_tensor(name, fields[name], [rows, goal])
         check_same_device(fields.items())
         for name, value in fields.items():
-            self._register(name, value)
+            register(self, name, value)
 
     @takes_arrays
     def forward(self, goal: Tensor, horizon: int = 1) -> QuadraticCost:

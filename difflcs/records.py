@@ -81,6 +81,18 @@ def _numbers_of(tensor: Tensor) -> int | None:
     return None if unread else hash(tensor.detach().cpu().numpy().tobytes())
 
 
+def index_batch(name: str, value: Tensor, batch: torch.Size, index: Any) -> Tensor:
+    """Index a tensor of a record `name`, whose first dimensions are the batch, in these alone."""
+    key = index if isinstance(index, tuple) else (index,)
+    try:
+        return value[(*key, *[slice(None)] * (value.ndim - len(batch)))]
+    except (IndexError, TypeError) as error:
+        raise BatchIndexError(
+            f"{name}: expected an index of the batch dimensions {tuple(batch)}, got {describe(index)}: {error}; index "
+            f"the elements of the batch, and a tensor by its name"
+        ) from error
+
+
 # Name → kinds of its dimensions, in the order of every list of these matrices.
 SYSTEM = dimensions(SystemMatrices)
 
@@ -190,18 +202,11 @@ class _Record(SystemMatrices):
                 f"{type(self).__name__}: expected an index of a batch dimension, got {describe(index)} where "
                 f"every field is shared by the batch; build it from tensors with leading batch dimensions"
             )
-        key = index if isinstance(index, tuple) else (index,)
         for name, value in self.tensors().items():
             rank = self._rank(name)
             if value.ndim > rank:
                 value = value.expand(*batch, *value.shape[value.ndim - rank :])
-                try:
-                    value = value[(*key, *[slice(None)] * rank)]
-                except (IndexError, TypeError) as error:
-                    raise BatchIndexError(
-                        f"{type(self).__name__}: expected an index of the batch dimensions {tuple(batch)}, got "
-                        f"{describe(index)}: {error}; index the systems, and a tensor of one of them by its name"
-                    ) from error
+                value = index_batch(type(self).__name__, value, batch, index)
             values[name] = value
         return type(self)(**values)
 

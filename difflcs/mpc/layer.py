@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, takes_arrays
 from difflcs._differentiation import runs_eagerly
+from difflcs._fields import register
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound
 from difflcs.errors import DegenerateWarning, InvalidInputError, SolveError, SolveWarning, warn
@@ -115,11 +116,8 @@ class LCSMPCLayer(nn.Module):
         self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
         like = cost.Q if isinstance(cost, PLAIN_COSTS) else torch.empty(0)
         for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
-            value = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], like)
-            if isinstance(value, nn.Parameter):
-                self.register_parameter(name, value)
-            else:
-                self.register_buffer(name, value, persistent=False)
+            bound = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], like)
+            register(self, name, bound, persistent=False)
         self.setup().check()
         self._warned = False
         self._repeat = Repeat()

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import InitVar, dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import register_pytree_node
+from torch.utils._pytree import register_pytree_node, tree_map
 
 from difflcs._checks import describe_shapes
 from difflcs._differentiation import is_wrapped
 from difflcs._optional import require
 from difflcs.errors import BatchIndexError
 from difflcs.mpc.problem import MPCProblem
+from difflcs.records import index_batch
 from difflcs.status import Status, solved
 
 if TYPE_CHECKING:
@@ -92,6 +93,28 @@ class MPCSolution:
     def converged(self) -> Tensor:
         """(...) bool: the plan can be used (CONVERGED or DEGENERATE)."""
         return solved(self.status)
+
+    def detach(self) -> MPCSolution:
+        """Return the solutions without the graph, so that they can be kept or copied."""
+        return tree_map(Tensor.detach, self)
+
+    def __getitem__(self, index: Any) -> MPCSolution:
+        """Select solutions: an integer, slice, tensor, or a tuple of these, of the batch dimensions alone.
+
+        Raises:
+            BatchIndexError: there are no batch dimensions, or not these; or this is inside of `torch.func.vmap`.
+        """
+        if is_wrapped(self.status):
+            raise BatchIndexError("MPCSolution: expected an index outside of vmap, got one inside; index its result")
+        batch = self.status.shape
+        tensors, _ = _flatten(self)
+        places = torch.arange(batch.numel(), device=self.status.device).reshape(batch)
+        *tensors, places = (index_batch("MPCSolution", v, batch, index) for v in (*tensors, places))
+        return MPCSolution(*tensors, of=self.problem.select(places.flatten().cpu()))
+
+    def __iter__(self) -> Iterator[MPCSolution]:
+        """Iterate over the solutions along the first batch dimension."""
+        return (self[i] for i in range((self.status.shape or (1,))[0]))
 
     def complementarity(self) -> Tensor:
         """(...) largest |λ·s − relaxation| over the horizon."""

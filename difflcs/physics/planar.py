@@ -38,7 +38,7 @@ from difflcs._checks import (
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces, given_states
-from difflcs.physics.shapes import Distance, Shape
+from difflcs.physics.shapes import Shape
 from difflcs.records import LCSParams
 
 _INSTANTS = 8  # of a step, in `Drive.course`
@@ -250,17 +250,14 @@ class PlanarPushing:
         values["compliance"] = self._of_discs("compliance", self.compliance, strict=True)
         center = self.shape.centroid if self.center_of_mass is None else self.center_of_mass
         values["center_of_mass"] = _number("center_of_mass", center, sizes=[(2,)])
-        gyration = self._default_gyration() if self.gyration is None else self.gyration
+        if (gyration := self.gyration) is None:
+            area, centroid, polar = self.shape.moments()
+            gyration = (polar / area + (values["center_of_mass"] - centroid).square().sum()).sqrt()
         values["gyration"] = _number("gyration", gyration, 0.0, strict=True, sizes=[(), (1,)])
         length = float(values["gyration"].detach()) if self.length is None else self.length
         values["length"] = check_number("length", length, strict=True)
         for name, value in values.items():
             object.__setattr__(self, name, value)
-
-    def _default_gyration(self) -> Tensor:
-        area, centroid, polar = self.shape.moments()
-        offset = _number("center_of_mass", centroid if self.center_of_mass is None else self.center_of_mass) - centroid
-        return (polar / area + offset.square().sum()).sqrt()
 
     def _of_discs(self, name: str, value: float | Tensor, strict: bool = False) -> Tensor:
         return _number(name, value, 0.0, strict, [(), (self.n_discs,)]).expand(self.n_discs)
@@ -311,8 +308,11 @@ class PlanarPushing:
     def _params(self, x: Tensor) -> LCSParams:
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
         contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
+        force = None
         if self.inertia is not None:
             contacts, compliance = _damp(contacts, free.response, compliance)
+            mass = float(_number("mass", self.inertia.mass, 0.0, True).detach())
+            force = (self.length or 1.0) * mass / float(self.inertia.seconds)
         return contact_lcs(
             contacts,
             free,
@@ -321,17 +321,11 @@ class PlanarPushing:
             compliance=compliance,
             cone=self.cone,
             length=self.length or 1.0,
-            force=self._unit_of_force(),
+            force=force,
         )
 
     def _by_contact(self, value: Any) -> Tensor:
         return value.repeat_interleave(self.parts_touched)
-
-    def _unit_of_force(self) -> float | None:
-        if self.inertia is None:
-            return None
-        mass = float(_number("mass", self.inertia.mass, 0.0, True).detach())
-        return (self.length or 1.0) * mass / float(self.inertia.seconds)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
@@ -341,7 +335,7 @@ class PlanarPushing:
         nearest = self.shape.distance(to_body(x, discs))
         if parts < self.shape.n_parts:
             kept = nearest.distance.detach().topk(parts, largest=False).indices
-            nearest = Distance(*(_select(value, kept) for value in nearest))
+            nearest = nearest.select(kept)
         gap = nearest.distance - torch.as_tensor(self.radius).unsqueeze(-1)
         cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
 
@@ -368,15 +362,6 @@ class PlanarPushing:
         center: Any = self.center_of_mass
         cos, sin = yaw.cos(), yaw.sin()
         return torch.stack([cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]], -1)
-
-    def _mobility(self, x: Tensor) -> Tensor:
-        """Compute the mobility (..., 3, 3): the motion of the pose by a force and a torque dual to it, for mass 1."""
-        cx, cy = self._center_offset(x[..., 2]).unbind(-1)
-        # The pose is that of the body's origin, which turns about the centre of mass.
-        turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
-        gyration: Any = self.gyration
-        plane = torch.diag(x.new_tensor([1.0, 1.0, 0.0]))
-        return plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
 
     def _without_contact(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Compute A and B, and the response of the discs alone."""
@@ -412,7 +397,13 @@ class PlanarPushing:
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
         A, B, response = self._without_contact(x)
-        mobility, rest = self._mobility(x), self.n_x - 3
+        cx, cy = self._center_offset(x[..., 2]).unbind(-1)
+        # The pose is that of the body's origin, which turns about the centre of mass.
+        turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
+        gyration: Any = self.gyration
+        plane, rest = torch.diag(x.new_tensor([1.0, 1.0, 0.0])), self.n_x - 3
+        # Motion of the pose (..., 3, 3) by a force and a torque dual to it, for mass 1.
+        mobility = plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
         if self.inertia is None:
             return FreeMotion(A, B, x.new_zeros(self.n_x), response + pad(mobility, (0, rest, 0, rest)))
         h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
@@ -452,13 +443,6 @@ def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
         return None
     values = [getattr(part, field.name) for part in parts if part is not None for field in fields(part)]  # pyright: ignore
     return tuple(values) if all(isinstance(value, int | float) for value in values) else None
-
-
-def _select(values: Tensor, parts: Tensor) -> Tensor:
-    """Select values (..., n_parts) or (..., n_parts, 2) of the parts (..., k)."""
-    if values.ndim > parts.ndim:
-        return values.gather(-2, parts.unsqueeze(-1).expand(*parts.shape, values.shape[-1]))
-    return values.gather(-1, parts)
 
 
 def to_body(x: Tensor, points: Tensor) -> Tensor:

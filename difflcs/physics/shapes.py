@@ -37,6 +37,11 @@ class Distance(NamedTuple):
     normal: Tensor
     point: Tensor
 
+    def select(self, parts: Tensor) -> "Distance":
+        """Select parts (..., k) of each point."""
+        rows = parts.unsqueeze(-1).expand(*parts.shape, 2)
+        return Distance(self.distance.gather(-1, parts), self.normal.gather(-2, rows), self.point.gather(-2, rows))
+
 
 class Moments(NamedTuple):
     """Area, centroid (2,), and polar second moment of area about the centroid."""

@@ -91,11 +91,9 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
 def _move_onto_level(shape: Shape, points: Tensor, distance: float) -> Tensor:
     """Move points along the gradient of the distance until they have this distance."""
     for _ in range(3):
-        nearest = shape.distance(points)
-        part = nearest.distance.argmin(-1, keepdim=True)
-        gap = nearest.distance.gather(-1, part)
-        normal = nearest.normal.gather(-2, part.unsqueeze(-1).expand(*part.shape, 2)).squeeze(-2)
-        points = points + (distance - gap) * normal
+        of_parts = shape.distance(points)
+        nearest = of_parts.select(of_parts.distance.argmin(-1, keepdim=True))
+        points = points + (distance - nearest.distance) * nearest.normal.squeeze(-2)
     return points
 
 

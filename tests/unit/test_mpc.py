@@ -31,6 +31,7 @@ from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import Backend, BatchedBackend, certify
 from difflcs.mpc.backends.base import Result
 from difflcs.mpc.problem import INPUTS
+from tests.conftest import refuse
 
 SOLVER = BatchedBackend(threads=1)
 
@@ -395,6 +396,21 @@ def test_a_plan_and_a_system_print_their_shapes_and_how_the_plan_ended(build, la
     )
     assert [part for part in shown if part not in text] == []
     assert len(text) < 1000
+
+
+def test_plans_are_selected_and_detached(build, x0):
+    layer = make_layer(build, lcs=build.params(batch=(2, 3)))
+    plan = layer(x0.reshape(2, 3, 4).requires_grad_())
+    for index in (1, (0, 2), slice(1), (slice(None), 0), plan.objective > 0, torch.tensor([1, 1, 0])):
+        part = plan[index].detach()
+        assert torch.equal(part.action, plan.action[index])
+        assert torch.equal(part.complementarity(), plan.complementarity()[index])
+        assert [plan[index].u.requires_grad, part.u.requires_grad] == [True, False]
+    assert [len(one.u) for one in plan] == [3, 3]
+    for index in (2, (0, 0, 0), "A", 1.0):
+        refuse(BatchIndexError, r"batch dimensions \(2, 3\), got", plan.__getitem__, index)
+    refuse(BatchIndexError, r"batch dimensions \(\), got", list, plan[0, 0])
+    refuse(BatchIndexError, "outside of vmap", torch.func.vmap(lambda x: layer(x)[...]), x0)
 
 
 def test_a_plan_is_drawn(layer, x0):

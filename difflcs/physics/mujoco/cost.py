@@ -23,7 +23,7 @@ from difflcs._checks import (
     describe,
     did_you_mean,
 )
-from difflcs._fields import TensorFields
+from difflcs._fields import TensorFields, register
 from difflcs.cost import QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco.lcs import MujocoLCS
@@ -174,11 +174,11 @@ class MujocoCost(TensorFields):
                 weight = _weight(f"{row.about}: {name}", getattr(term, name, None), row.size)
                 at = stages, slice(ends[k], ends[k + 1])
                 if isinstance(weight, Tensor):
-                    self._register(f"{name}_{k}", weight)
+                    register(self, f"{name}_{k}", weight)
                     self._learned.append((f"{name}_{k}", at))
                 elif weight is not None:
                     weights[at] = weight
-        self._register("weights", torch.from_numpy(weights))
+        register(self, "weights", torch.from_numpy(weights))
         kinds = np.array([row.kind for row in rows for _ in range(row.size)], int)
         self._squares, self._efforts = np.flatnonzero(kinds != _EFFORT), np.flatnonzero(kinds == _EFFORT)
         self._rows = [row for row in rows if row.kind != _EFFORT]
