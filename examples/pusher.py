@@ -351,7 +351,8 @@ def main(o: Options) -> None:
         finals.append(float(np.linalg.norm(data.body("object").xpos - data.body("goal").xpos)))
         returns.append(total)
         print(f"seed {seed}: return {total:.1f}, {100 * finals[-1]:.1f} cm from the goal at the end", flush=True)
-    mean, error = float(np.mean(returns)), 1.96 * float(np.std(returns, ddof=1)) / len(returns) ** 0.5
+    mean, n = float(np.mean(returns)), len(returns)
+    error = 1.96 * float(np.std(returns, ddof=1)) / n**0.5 if n > 1 else np.inf
     times = f"{np.mean(before):.1f} s before an episode, {1e3 * np.mean(seconds):.0f} ms a step"
     print(f"mean return {mean:.1f} [{mean - error:.1f}, {mean + error:.1f}]; {times}")
     if o.json:
