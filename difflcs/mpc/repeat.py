@@ -68,14 +68,9 @@ class _Prepared:
     """Copy of a problem that a layer has solved, with a snapshot of the values that it was made of."""
 
     def __init__(
-        self,
-        signature: tuple,
-        mappings: list[Mapping[str, object]],
-        before: Snapshot,
-        goal: Snapshot,
-        solver: MPCSolver,
+        self, signature: tuple, mappings: list[Mapping[str, object]], taken: Snapshot, goal: Snapshot, solver: MPCSolver
     ):
-        self.signature, self.mappings, self.snapshot, self.latest = signature, mappings, before, (solver.copy(), goal)
+        self.signature, self.mappings, self.snapshot, self.latest = signature, mappings, taken, (solver.copy(), goal)
         inputs, problem = solver.inputs, solver.problem
         shapes = [(inputs.horizon + extra, inputs.sizes[size]) for extra, size in GUESS.values()]
         self.flat = [torch.Size((problem.batch, *shape)) for shape in shapes]

@@ -12,8 +12,15 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs import _checks
-from difflcs._checks import check_array, check_choice, check_kind, check_number, check_positive_int, check_tensor
+from difflcs._checks import (
+    check_array,
+    check_choice,
+    check_kind,
+    check_number,
+    check_positive_int,
+    check_tensor,
+    takes_arrays,
+)
 from difflcs.errors import InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
     Bounded,
@@ -279,7 +286,7 @@ class MujocoLCS:
         read = self._read(x)
         return Contacts(*map(torch.from_numpy, read.contacts(read.dof_contacts)))
 
-    @_checks.takes_arrays
+    @takes_arrays
     def control(self, x: Tensor, u: Tensor) -> Tensor:
         """Convert to MuJoCo's `ctrl` (..., nu) actions u (..., n_u) at states x (..., n_x).
 

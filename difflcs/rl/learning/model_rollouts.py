@@ -7,7 +7,6 @@ computing time instead.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from difflcs._checks import check_positive_int
-from difflcs.errors import DiffLCSWarning, InvalidInputError
+from difflcs.errors import DiffLCSWarning, InvalidInputError, warn
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.rollout import (
@@ -236,7 +235,7 @@ class ModelRollouts:
         off[ended] |= success[ended] != real["success"]
         if (share := float(off.double().mean())) > 0.01:
             text = f"outcome: expected what env.step gives, got another reward or success in {share:.0%} of the steps"
-            warnings.warn(f"{text}; PPO would learn another task: mend TaskSpec.outcome", DiffLCSWarning, stacklevel=2)
+            warn(f"{text}; PPO would learn another task: mend TaskSpec.outcome", DiffLCSWarning)
 
     def fit(self) -> float:
         """Fit the ensemble to all episodes, and let the environment start from them; returns the loss."""
