@@ -30,12 +30,12 @@ import tyro
 from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
-from difflcs.cli.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, machine, save, states_and_goals
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.solution import Primal
 from difflcs.rl import Ensemble, get_method, get_task
 from difflcs.rl.learning.pddm import Planner
-from difflcs.systems import cart_pole_between_walls
+from difflcs.systems import cart_pole_between_walls, pushing_cost
 
 EPISODE = 20  # steps from one start to the next
 

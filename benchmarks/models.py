@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
-from difflcs.cli.bench import ACTION_LIMIT, pushing_cost, pushing_model, states_and_goals
-from difflcs.systems import cart_pole_between_walls
+from difflcs.cli.bench import ACTION_LIMIT, pushing_model, states_and_goals
+from difflcs.systems import cart_pole_between_walls, pushing_cost
 
 
 def random_model(n_lam: int, seed: int, n_x: int = 9, n_u: int = 6) -> LCSParams:

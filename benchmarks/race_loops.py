@@ -40,8 +40,9 @@ from difflcs.mpc.backends.base import Result
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.rl import wilson_interval
+from difflcs.systems import pushing_cost
 from difflcs_envs.hand.model import build_model
-from difflcs_envs.tasks import HORIZON, hand_cost, hand_system, pushing_cost
+from difflcs_envs.tasks import HORIZON, hand_cost, hand_system
 from difflcs_envs.trifinger.task import ACTION_LIMIT
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))

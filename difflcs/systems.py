@@ -1,22 +1,24 @@
 """Two small classic systems with contact: a cart-pole between soft walls, a block pushed along a wall.
 
 They are linear complementarity systems from first principles, not learned: examples, test cases, and a pattern for your
-own. Each function returns `LCSParams`; `LCSModel.from_params` makes a model of them, to simulate or to learn from.
+own. Each returns `LCSParams`; `LCSModel.from_params` makes a model of them, to simulate or to learn from. Beside them,
+`pushing_cost` is the cost of the paper's own task.
 
 Time steps are semi-implicit: forces change the velocity, the new velocity moves the position, and the gap of a contact
 is that at the *end* of the step (Stewart & Trinkle 1996). So a contact acts in the step in which it closes, and
 F = (effect of the forces on the gaps) + compliance is symmetric positive definite up to friction.
 
-Every argument is a number or a tensor of one element; the matrices are differentiable in the tensors.
+Every argument of a system is a number or a tensor of one element; the matrices are differentiable in the tensors.
 """
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import check_number
+from difflcs.cost import GoalCost
 from difflcs.records import LCSParams
 
-__all__ = ["block_along_wall", "cart_pole_between_walls"]
+__all__ = ["block_along_wall", "cart_pole_between_walls", "pushing_cost"]
 
 Number = float | Tensor
 
@@ -170,6 +172,27 @@ def block_along_wall(
         E=_matrix([[-cos, sin], [0, 0], [0, 0], [0, 0], [0, 0]]),
         F=F,
         c=torch.zeros(5, dtype=torch.float64),
+    )
+
+
+def pushing_cost() -> GoalCost:
+    """Cost of the paper's MPC, which pushes an object on a table with three fingertips (Eq. 13).
+
+    Stage: 10 Σ‖tip − object‖² + 200 ‖object − goal‖² + 0.3 (yaw − goal yaw)² + 200 ‖u‖²; final: 6, 200 and 1.5.
+
+    Returns:
+        A `GoalCost` of states (9,): x, y [m] and yaw [rad] of the object, x, y [m] of the tips; actions (6,): steps of
+        the tips [m]; goals (x [m], y [m], yaw [rad]).
+    """
+    return GoalCost.reach(
+        9,
+        6,
+        goal_weight=(200.0, 200.0, 0.3),
+        goal_weight_final=(200.0, 200.0, 1.5),
+        input_weight=200.0,
+        pairs=[(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)],
+        pair_weight=10.0,
+        pair_weight_final=6.0,
     )
 
 

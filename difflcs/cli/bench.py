@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 import difflcs
-from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, _storage
+from difflcs import LCSModel, LCSMPCLayer, LCSParams, _storage
 from difflcs._checks import check_positive_int
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.systems import pushing_cost
 
 ACTION_LIMIT = 0.015
 """Bound of each action [m], as in the pushing tasks."""
@@ -42,32 +43,13 @@ class Timing:
         return self.ipopt / self.batched
 
 
-def pushing_cost() -> GoalCost:
-    """Make a cost as of pushing an object with three fingers: 9 states, 3 of them with a goal, and 6 actions."""
-    pairs = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
-    return GoalCost.reach(
-        9,
-        6,
-        goal_weight=(200.0, 200.0, 0.3),
-        goal_weight_final=(200.0, 200.0, 1.5),
-        input_weight=200.0,
-        pairs=pairs,
-        pair_weight=10.0,
-        pair_weight_final=6.0,
-    )
-
-
-def measure(
-    cost: GoalCost, n_lam: int = 5, batch: int = 1024, ipopt_batch: int = 8, repeats: int = 3, threads: int = 1
-) -> list[Timing]:
-    """Time the paper's MPC around a synthetic pushing model: forward, and forward with backward.
+def measure(batch: int, ipopt_batch: int, repeats: int, threads: int) -> list[Timing]:
+    """Time the paper's MPC around a synthetic pushing model of 5 contacts: forward, and forward with backward.
 
     Both backends solve problems of one distribution through the same layer, tensors in, tensors out. Absolute times of
     a shared machine mean little; the ratio says more.
 
     Args:
-        cost: of the MPC, such as `pushing_cost()`.
-        n_lam: contacts.
         batch: problems per call of backend batched.
         ipopt_batch: problems per call of backend ipopt.
         repeats: timings, the best counts; IPOPT gets a third of them.
@@ -78,7 +60,7 @@ def measure(
     """
     for name, value in (("batch", batch), ("ipopt_batch", ipopt_batch), ("repeats", repeats), ("threads", threads)):
         check_positive_int(name, value)
-    model = LCSModel.from_params(pushing_model(n_lam, seed=0))
+    model = LCSModel.from_params(pushing_model(n_lam=5, seed=0))
     x0, goal = states_and_goals(max(batch, ipopt_batch), seed=1)
     candidates = (
         (BatchedBackend(threads=1), batch, repeats),
@@ -89,7 +71,7 @@ def measure(
     for work, run in (("forward", _solve), ("forward + backward", _differentiate)):
         seconds = []
         for backend, count, times in candidates:
-            mpc = LCSMPCLayer(model, cost, 5, -ACTION_LIMIT, ACTION_LIMIT, backend=backend, on_failure="mask")
+            mpc = LCSMPCLayer(model, pushing_cost(), 5, -ACTION_LIMIT, ACTION_LIMIT, backend=backend, on_failure="mask")
             seconds.append(best(times, lambda mpc=mpc, run=run, n=count: run(mpc, x0[:n], goal[:n])) / count)
         timings.append(Timing(work, *seconds))
     return timings

@@ -90,7 +90,7 @@ class Bench:
 
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         sizes = (16, 2, 1) if self.smoke else (self.batch, self.ipopt_batch, self.repeats)
-        timings = bench.measure(bench.pushing_cost(), 5, *sizes, threads=threads)
+        timings = bench.measure(*sizes, threads=threads)
         if self.json:
             record = {"timings": [{**asdict(t), "ratio": t.ratio} for t in timings], "threads": threads}
             print(json.dumps({**record, "batch": sizes[0], "ipopt_batch": sizes[1], "machine": bench.machine()}))

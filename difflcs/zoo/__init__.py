@@ -9,7 +9,6 @@
 A maintainer adds a finished run by `python reproduce/add_to_zoo.py RUN` in a checkout of the repository.
 """
 
-import difflib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from difflcs import _storage
+from difflcs._checks import did_you_mean
 from difflcs.errors import CheckpointError
 
 __all__ = ["MODELS", "PREFIX", "ModelCard", "card", "names", "path"]
@@ -116,8 +116,7 @@ def path(name: str, root: Path = MODELS) -> Path:
     known = names(root)
     if name in known:
         return root / name
-    near = difflib.get_close_matches(name, known, n=2)
-    advice = f"did you mean {' or '.join(near)}?" if near else "`difflcs zoo` lists them"
+    advice = f"`difflcs zoo` lists them{did_you_mean(name, known)}"
     raise CheckpointError(f"zoo: expected one of {', '.join(known) or 'no models'}, got {name!r}; {advice}")
 
 

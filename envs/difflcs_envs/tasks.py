@@ -14,6 +14,7 @@ from torch import Tensor
 
 from difflcs.cost import GoalCost
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, register_task
+from difflcs.systems import pushing_cost
 from difflcs_envs.hand import task as hand
 from difflcs_envs.trifinger.arguments import checked_task
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
@@ -26,26 +27,6 @@ MOVE_GOALS = ((0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, 
 HAND_GOAL = (-0.02, 0.0, 0.036, 0.5**0.5, 0.0, 0.0, 0.5**0.5)  # a cube in the middle of the palm, a quarter turn on
 HAND_GUESS = {"object_mass": 3.0, "friction": 0.5, "servo_gain": 0.5}  # factors by which `hand_unknown` is told wrong
 TURN_GOALS = ((0.0, 0.0, 0.8), (0.0, 0.0, -0.8), (0.0, 0.0, 1.4), (0.0, 0.0, -0.3))
-
-
-def pushing_cost() -> GoalCost:
-    """Cost of the MPC for pushing an object on the table (Eq. 13 of the paper).
-
-    Stage: 10 Σ‖tip − object‖² + 200 ‖object − goal‖² + 0.3 (yaw − goal yaw)² + 200 ‖u‖²; final: 6, 200 and 1.5.
-
-    Returns:
-        A `GoalCost` of goals (x [m], y [m], yaw [rad]).
-    """
-    return GoalCost.reach(
-        STATE_SIZE,
-        ACTION_SIZE,
-        goal_weight=(200.0, 200.0, 0.3),
-        goal_weight_final=(200.0, 200.0, 1.5),
-        input_weight=200.0,
-        pairs=[(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)],
-        pair_weight=10.0,
-        pair_weight_final=6.0,
-    )
 
 
 def contact_cost() -> GoalCost:

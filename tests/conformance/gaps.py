@@ -10,17 +10,16 @@ python -m tests.conformance.gaps --first 17 --count 1
 
 import argparse
 import itertools
-import multiprocessing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from difflcs.physics.mujoco import MujocoLCS
+from tests.conformance.scenes import judge_seeds
 
 KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 PAIRS = [pair for pair in itertools.combinations_with_replacement(KINDS, 2) if pair != ("plane", "plane")]
@@ -269,21 +268,12 @@ def table(judged: list[Judged]) -> str:
 
 
 def main() -> None:
-    """Judge scenes, print the table and the seeds that are wrong."""
+    """Judge pairs of shapes, and put the table into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
-    parser.add_argument("--count", type=int, default=1000, help="number of scenes")
-    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument(
         "--fill", type=Path, nargs="?", const=Path("docs/promises.md"), help="page to put the table into"
     )
-    options = parser.parse_args()
-    seeds = range(options.first, options.first + options.count)
-    with multiprocessing.get_context("spawn").Pool(options.processes, torch.set_num_threads, (1,)) as pool:
-        results = dict(zip(seeds, pool.imap(judge, seeds, chunksize=20), strict=True))
-    judged = [j for j in results.values() if j]
-    text = table(judged)
-    print(text, *(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+    options, text = judge_seeds(parser, judge, table)
     if options.fill:
         head, rest = options.fill.read_text().split("<!-- gaps: begin -->")
         options.fill.write_text(

@@ -338,9 +338,8 @@ def _prepare() -> None:
     mujoco.set_mju_user_warning(lambda message: None)
 
 
-def main() -> None:
-    """Judge scenes, print the table and the seeds that are wrong."""
-    parser = argparse.ArgumentParser(description="Judge random scenes.")
+def judge_seeds(parser: argparse.ArgumentParser, judge: Any, table: Any) -> tuple[argparse.Namespace, str]:
+    """Judge the scenes that the command line asks for; print and return their table, and print the wrong ones."""
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--count", type=int, default=1000, help="number of scenes")
     parser.add_argument("--processes", type=int, default=2)
@@ -348,9 +347,10 @@ def main() -> None:
     seeds = range(options.first, options.first + options.count)
     with multiprocessing.get_context("spawn").Pool(options.processes, _prepare) as pool:
         results = dict(zip(seeds, pool.imap(judge, seeds, chunksize=20), strict=True))
-    print(table([j for j in results.values() if j]))
-    print(*(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+    text = table([j for j in results.values() if j])
+    print(text, *(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+    return options, text
 
 
 if __name__ == "__main__":
-    main()
+    judge_seeds(argparse.ArgumentParser(description="Judge random scenes."), judge, table)

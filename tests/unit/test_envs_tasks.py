@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from difflcs.rl.tasks import get_task, task_names
-from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifinger_task
+from difflcs.systems import pushing_cost
+from difflcs_envs.tasks import MOVE, caption, contact_cost, trifinger_task
 from difflcs_envs.ycb import YCB
 
 NAMES = ("cube", "turn_cube", *YCB)

@@ -12,10 +12,11 @@ import pytest
 import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
-from difflcs.cli.bench import pushing_cost, pushing_model, states_and_goals
+from difflcs.cli.bench import pushing_model, states_and_goals
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
+from difflcs.systems import pushing_cost
 from tests.conformance.varied.generators import random_case
 
 

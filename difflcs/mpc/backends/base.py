@@ -71,13 +71,6 @@ class Backend(ABC):
     requires: ClassVar[tuple[str, ...]] = ()
     install: ClassVar[str] = "pip install difflcs"
 
-    def check(self, problem: MPCProblem) -> None:  # noqa: B027  most have nothing to refuse
-        """Refuse a problem that this backend cannot solve, before anything is solved.
-
-        Raises:
-            InvalidInputError: what it cannot do, and which backend can.
-        """
-
     def after(self, seconds: float) -> "Backend":
         """Return the backend for a call of a layer that needs some seconds besides; one with a time limit has less."""
         return self
@@ -143,7 +136,7 @@ def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Prima
 def check_plain(problem: MPCProblem, name: str) -> None:
     """Refuse a problem that varies by stage, or has S, constraints, infinite bounds or no contact.
 
-    For a backend `name` that takes one system, cost and bounds for all stages only; see `Backend.check`.
+    For a backend `name` that takes one system, cost and bounds for all stages only.
 
     Raises:
         InvalidInputError: the problem has one of these; the message says which.

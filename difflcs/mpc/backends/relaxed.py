@@ -123,17 +123,13 @@ class RelaxedBackend(Backend):
             check_number(name, getattr(self, name), strict=True)
         check_threads(self.threads)
 
-    def check(self, problem: MPCProblem) -> None:
-        """Refuse what the convex program does not have."""
-        check_plain(problem, self.name)
-
     def solve(self, problem: MPCProblem, guess: Primal | None) -> RelaxedResult:
         """Solve one pass per penalty, or only the last with a guess.
 
         Raises:
-            InvalidInputError: the problem has what this backend cannot do, see `check`.
+            InvalidInputError: the problem has what the convex program does not have, see `check_plain`.
         """
-        self.check(problem)
+        check_plain(problem, self.name)
         started = time.perf_counter()
         batch = problem.batch
         zero = torch.zeros(batch, problem.horizon, problem.n_u, dtype=torch.float64)

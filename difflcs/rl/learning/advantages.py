@@ -22,6 +22,8 @@ from difflcs.rl.tasks import Features, compute_features
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
+    from difflcs.rl.learning.model_rollouts import ModelEnv
+
 SAMPLES = ("action", "action_log_prob")
 ZETA = 0.5
 """ζ of advantages of many actions."""
@@ -158,14 +160,6 @@ class GAEAdvantages:
         return Estimate(samples, gae.values, rewards)
 
 
-class AlternativePredictor(Protocol):
-    """Predicts the outcome of other actions, as `difflcs.rl.learning.model_rollouts.ModelEnv` does."""
-
-    def predict_alternatives(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States (N, T, n_x), actions (N, T, M, n_u), goals → next states, rewards and successes (N, T, M, ·)."""
-        ...
-
-
 class MultiActionAdvantages:
     """Advantages of many actions for each state of model rollouts, see the module.
 
@@ -181,7 +175,7 @@ class MultiActionAdvantages:
 
     def __init__(
         self,
-        env: AlternativePredictor,
+        env: ModelEnv,
         critic: ValueFunction,
         features: Features,
         scale: RewardScale,
