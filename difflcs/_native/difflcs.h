@@ -113,9 +113,11 @@ DIFFLCS_API difflcs_status difflcs_set_fallback(difflcs_controller* controller, 
 /* Other numbers of the system, in the order A B C d D E F c, or of the cost, in the order Q R S Q_final q r q_final (Q, R
  * and Q_final symmetric): for a robot that linearises them anew before a step. Row-major, with the sizes of those in the
  * file, stages included, and copied; F + F^T must stay positive definite, and the cost convex. Returns DIFFLCS_INVALID,
- * and changes nothing, where one is NULL or not finite, or the cost has goals. */
+ * and changes nothing, where one is NULL or not finite, or the cost has goals. Bounds of the actions likewise, each u_min
+ * below its u_max. */
 DIFFLCS_API difflcs_status difflcs_set_system(difflcs_controller* controller, const double* const matrices[8]);
 DIFFLCS_API difflcs_status difflcs_set_cost(difflcs_controller* controller, const double* const terms[7]);
+DIFFLCS_API difflcs_status difflcs_set_bounds(difflcs_controller* controller, const double* u_min, const double* u_max);
 
 /* "CONVERGED" and so on. */
 DIFFLCS_API const char* difflcs_status_name(difflcs_status status);

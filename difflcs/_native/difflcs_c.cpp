@@ -1,8 +1,8 @@
 // The C interface, documented in difflcs.h. No exception leaves it.
 #include <cmath>
 #include <cstdio>
-#include <cstring>
 #include <exception>
+#include <iterator>
 #include <limits>
 #include <memory>
 #include <new>
@@ -148,22 +148,20 @@ difflcs_status difflcs_set_cost(difflcs_controller* c, const double* const terms
   return set_inputs(c, difflcs::kQ, 7, terms);
 }
 
+difflcs_status difflcs_set_bounds(difflcs_controller* c, const double* u_min, const double* u_max) {
+  if (!c || !u_min || !u_max) return DIFFLCS_INVALID;
+  const double* const bounds[2] = {u_min, u_max};
+  const auto& field = c->controller.data().field;
+  const int64_t low = field[difflcs::ku_min].count(), high = field[difflcs::ku_max].count();
+  for (int64_t j = 0; j < low || j < high; j++)  // one of them may be given by stage alone
+    if (!(u_min[j % low] < u_max[j % high])) return DIFFLCS_INVALID;
+  return set_inputs(c, difflcs::ku_min, 2, bounds);
+}
+
 const char* difflcs_status_name(difflcs_status status) {
-  switch (status) {
-    case DIFFLCS_CONVERGED:
-      return "CONVERGED";
-    case DIFFLCS_MAX_ITER:
-      return "MAX_ITER";
-    case DIFFLCS_INFEASIBLE:
-      return "INFEASIBLE";
-    case DIFFLCS_NUMERICAL:
-      return "NUMERICAL";
-    case DIFFLCS_DEGENERATE:
-      return "DEGENERATE";
-    case DIFFLCS_INVALID:
-      return "INVALID";
-  }
-  return "unknown";
+  constexpr const char* kNames[] = {"INVALID", "CONVERGED", "MAX_ITER", "INFEASIBLE", "NUMERICAL", "DEGENERATE"};
+  const int at = int(status) - int(DIFFLCS_INVALID);
+  return 0 <= at && at < int(std::size(kNames)) ? kNames[at] : "unknown";
 }
 
 const char* difflcs_isa(void) {

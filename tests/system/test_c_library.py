@@ -1,6 +1,7 @@
 """The C library from outside: built and installed without Python, found by CMake, and bit-equal to Python."""
 
 import csv
+import functools
 import json
 import os
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from difflcs import LCSModel, LCSMPCLayer, cli
 from difflcs.errors import InvalidInputError
@@ -43,7 +45,6 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("export")
     assert cli.main(["export", MODEL, "--out", str(folder)]) == 0
     rng = np.random.default_rng(0)
-    lcs = LCSModel.from_pretrained(MODEL)
     controller = MPCController.load(folder / "controller.difflcs")
     rows, x, goal = [], np.zeros(9), np.zeros(3)
     for k in range(60):
@@ -53,10 +54,8 @@ def exported(tmp_path_factory):
         controller.step(x, goal)
         x = controller.plan.x[1] + 1e-3 * rng.normal(size=9)
     rows[30][4] = float("nan")  # a sensor that failed once
-    with (folder / "trajectory.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([f"x{i}" for i in range(lcs.n_x)] + [f"goal{i}" for i in range(3)])
-        writer.writerows([[repr(float(v)) for v in row] for row in rows])
+    names = ",".join([f"x{i}" for i in range(9)] + [f"goal{i}" for i in range(3)])
+    np.savetxt(folder / "trajectory.csv", rows, "%.17g", ",", header=names, comments="")
     return folder
 
 
@@ -77,6 +76,7 @@ def installed(tmp_path_factory):
 def project(installed, tmp_path_factory):
     """Builds a project that finds the library."""
 
+    @functools.cache
     def make(source):
         folder = tmp_path_factory.mktemp("project")
         call("cmake", "-S", ROOT / source, "-B", folder, f"-DCMAKE_PREFIX_PATH={installed}")
@@ -118,6 +118,29 @@ def test_the_example_closes_the_loop_bit_equal_to_python(exported, robot):
     assert statuses[30] == "NUMERICAL"
     assert statuses.count("CONVERGED") + statuses.count("DEGENERATE") >= 58
     assert len({row[1:] for row in ours}) > 50  # the robot moves
+
+
+@pytest.mark.slow
+@needs_tools
+def test_a_hand_is_linearised_anew_before_each_step(project, tmp_path):
+    gymnasium, tasks = pytest.importorskip("gymnasium"), pytest.importorskip("difflcs_envs.tasks")
+    env = gymnasium.make("difflcs/HandTurnObject-v0").unwrapped
+    goal, module = torch.from_numpy(env.reset(seed=0)[0]["goal"]), tasks.hand_system(env.model)
+    options = {"horizon": 4, "backend": BatchedBackend(restarts=1), "relaxation": 1e-3}
+    mpc = LCSMPCLayer(module, tasks.hand_cost(module), u_min=-0.05, u_max=0.05, **options)
+    files, controller, steps = (tmp_path / "hand.difflcs", tmp_path / "changes"), mpc.controller(), []
+    for _ in range(4):
+        x = module.observe(env.data)
+        lcs, cost = module.params(x), mpc.cost.at(x, goal)
+        low, high = (bound.clamp(-0.05, 0.05) for bound in module.action_bounds(x))
+        if not steps:
+            LCSMPCLayer(lcs, cost, u_min=low, u_max=high, **options).controller().save(files[0])
+        env.step(u := controller.step(x, goal))
+        weights = cost.Q, cost.R, torch.zeros(22, 16), cost.Q_final, cost.q, cost.r, cost.q_final
+        arrays = *lcs.tensors().values(), *weights, low, high, x, torch.from_numpy(u)
+        steps += [array.double().flatten() for array in arrays]
+    files[1].write_bytes(torch.cat(steps).numpy().tobytes())
+    assert call(project("tests/native/c") / "contract_difflcs", *files) == "all holds\n"
 
 
 @pytest.mark.slow

@@ -79,22 +79,14 @@ def test_rotations_are_those_of_mujoco_and_continue_through_half_a_turn():
     np.testing.assert_allclose(continued_rotation(quaternion, before), (0.1 - 0.5 * np.pi) * axis, atol=1e-7)
 
 
-BAD = {"object": "cup", "object_mass": 0.0, "friction": -1, "servo_gain": 0, "turn": 4, "render_mode": "human"}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_arguments(name):
-    with pytest.raises(ValueError, match=r"Expected .*got"):
-        HandTurnObjectEnv(**{name: BAD[name]})
-
-
-@pytest.mark.parametrize(
-    "options", [{"goal": [0, 0, 0]}, {"goal": np.zeros(7)}, {"state": np.full(22, 7.0)}, {"yaw": 1.0}, [1]]
-)
-def test_bad_options(options):
-    env = make()
-    with pytest.raises(ValueError, match=r"Expected .*got"):
-        env.reset(options=options)
+def test_bad_arguments_and_options():
+    env, bad = make(), {"object": "cup", "object_mass": 0.0, "friction": -1, "servo_gain": 0, "turn": 4}
+    for name, value in {**bad, "render_mode": "human"}.items():
+        with pytest.raises(ValueError, match=r"Expected .*got"):
+            HandTurnObjectEnv(**{name: value})
+    for options in ({"goal": [0, 0, 0]}, {"goal": np.zeros(7)}, {"state": np.full(22, 7.0)}, {"yaw": 1.0}, [1]):
+        with pytest.raises(ValueError, match=r"Expected .*got"):
+            env.reset(options=options)
 
 
 def test_the_system_predicts_open_joints_and_the_cost_is_zero_at_the_goal():

@@ -72,13 +72,9 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
         ([-20, -10], {"harm": 0.5}, 0, 3),  # all do harm: it stays
     ],
 )
-def test_of_controls_that_are_tried_the_first_that_ends_about_as_well_as_the_best_is_taken(
-    controls, options, chosen, tried
-):
-    body = '<body><joint type="slide" damping="1"/><geom size=".1" mass="1e-6"/></body>'
-    world = f'<worldbody>{body}</worldbody><actuator><motor joint="slide"/></actuator>'.replace(
-        "<joint", "<joint name='slide'"
-    )
+def test_the_first_control_that_ends_about_as_well_as_the_best_is_taken(controls, options, chosen, tried):
+    body = '<body><joint name="slide" type="slide" damping="1"/><geom size=".1" mass="1e-6"/></body>'
+    world = f'<worldbody>{body}</worldbody><actuator><motor joint="slide"/></actuator>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><option gravity='0 0 0' timestep='.01'/>{world}</mujoco>")
     ends, options = [], {"gain": 3.0, **options}
     rehearsal = Rehearsal(model, 0.1, lambda data: ends.append(data.time) or abs(data.qpos[0] - 1), **options)

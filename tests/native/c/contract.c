@@ -1,5 +1,6 @@
 /* Checks of difflcs.h that need C: arguments that are null, no allocation after loading, two controllers at once, and a
- * controller under deadlines. Usage: contract controller.difflcs; ends with 0 if all holds. */
+ * controller under deadlines. With a second argument, a robot of changing numbers. Usage:
+ * contract controller.difflcs [changes]; ends with 0 if all holds. */
 #include <difflcs.h>
 #include <math.h>
 #include <stdio.h>
@@ -42,7 +43,7 @@ static void null_pointers(const char* path) {
   EXPECT(c != NULL);
   if (!c) return;
   EXPECT(difflcs_step(c, NULL, goal, action) == DIFFLCS_INVALID);
-  EXPECT(difflcs_step(c, state, NULL, action) == DIFFLCS_INVALID);
+  EXPECT(difflcs_get_sizes(c).n_goal == 0 || difflcs_step(c, state, NULL, action) == DIFFLCS_INVALID);
   EXPECT(difflcs_step(c, state, goal, NULL) == DIFFLCS_INVALID);
   EXPECT(difflcs_follow(c, state, NULL, action) == DIFFLCS_INVALID);
   EXPECT(difflcs_set_fallback(c, DIFFLCS_GIVEN, NULL) == DIFFLCS_INVALID);
@@ -132,14 +133,58 @@ static void independent(const char* path, difflcs_controller* first, difflcs_siz
   difflcs_free(second);
 }
 
+/* A robot that linearises itself before each step. The file has for each of them the doubles of the system, of the
+ * cost, of the bounds, of the state, and of the action of Python's controller. A step that is late takes the next action
+ * of the last plan. */
+static void changes(difflcs_controller* c, difflcs_sizes n, const char* path) {
+  const size_t x = n.n_x, u = n.n_u, l = n.n_lam;
+  const size_t counts[19] = {x * x, x * u, x * l, x, l * x, l * u, l * l, l, x * x, u * u,
+                             x * u, x * x, x,     u, x,     u,     u,     x, u};
+  size_t starts[20] = {0};
+  for (int i = 0; i < 19; i++) starts[i + 1] = starts[i] + counts[i];
+  double* numbers = malloc(starts[19] * sizeof(double));
+  const double* fields[19];
+  for (int i = 0; i < 19; i++) fields[i] = numbers + starts[i];
+  FILE* file = fopen(path, "rb");
+  int steps = 0;
+  while (file && numbers && fread(numbers, sizeof(double), starts[19], file) == starts[19]) {
+    const long before = allocations;
+    difflcs_set_time_limit(c, 0);
+    EXPECT(difflcs_set_system(c, fields) == DIFFLCS_CONVERGED && difflcs_set_cost(c, fields + 8) == DIFFLCS_CONVERGED);
+    EXPECT(difflcs_set_bounds(c, fields[15], fields[16]) == DIFFLCS_CONVERGED);
+    const difflcs_status status = difflcs_step(c, fields[17], NULL, action);
+    EXPECT(status == DIFFLCS_CONVERGED || status == DIFFLCS_DEGENERATE);
+    EXPECT(allocations == before);
+    for (size_t j = 0; j < u; j++) EXPECT(fabs(action[j] - fields[18][j]) < 1e-6);
+    steps++;
+  }
+  memcpy(other, difflcs_get_plan(c).u + u, u * sizeof(double));
+  const long before = allocations;
+  difflcs_set_time_limit(c, 1e-9);
+  EXPECT(difflcs_step(c, fields[17], NULL, action) == DIFFLCS_MAX_ITER && difflcs_get_outcome(c).late == 1);
+  EXPECT(memcmp(action, other, u * sizeof(double)) == 0 && allocations == before);
+  EXPECT(steps > 1);
+  EXPECT(difflcs_set_bounds(c, fields[16], fields[15]) == DIFFLCS_INVALID); /* the larger one first */
+  EXPECT(difflcs_set_bounds(NULL, fields[15], fields[16]) == DIFFLCS_INVALID);
+  EXPECT(difflcs_set_bounds(c, fields[15], NULL) == DIFFLCS_INVALID && difflcs_set_cost(c, NULL) == DIFFLCS_INVALID);
+  if (file) fclose(file);
+  free(numbers);
+}
+
 int main(int argc, char** argv) {
   char error[256];
-  if (argc != 2) return 2;
+  if (argc < 2 || argc > 3) return 2;
   null_pointers(argv[1]);
   difflcs_controller* c = difflcs_load(argv[1], error, sizeof error);
   if (!c) return printf("%s\n", error), 1;
   const difflcs_sizes n = difflcs_get_sizes(c);
   if (n.n_x > 64 || n.n_u > 64 || n.n_goal > 64 || n.horizon > 63) return 2;
+  if (argc == 3) {
+    changes(c, n, argv[2]);
+    difflcs_free(c);
+    printf(failures ? "%d failures\n" : "all holds\n", failures);
+    return failures != 0;
+  }
   for (size_t j = 0; j < n.n_goal; j++) goal[j] = 0.05 / (double)(j + 1);
   for (size_t k = 0; k <= n.horizon; k++) memcpy(reference + k * n.n_goal, goal, n.n_goal * sizeof(double));
   for (size_t j = 0; j < n.n_u; j++) given[j] = 0.001 * (double)j;
