@@ -71,8 +71,16 @@ struct MpcStart {
   double needed = kHuge;  // if explored: left earlier where its steps gain too little to come below this objective
 };
 
+// Outputs of a batch.
+struct MpcPlans {
+  double *x, *u, *lam, *mu, *objective, *residual;  // residual as difflcs.mpc.kkt.residual, from the numbers returned
+  int8_t* status;                                   // unreached where the watch stopped before
+  int8_t* fragile;                                  // whether elimination without row exchanges lost digits
+  int32_t* iterations;
+};
+
 // Options and outputs of the solver.
-struct MpcSolve {
+struct MpcSolve : MpcPlans {
   const double* u_start;    // (count, H, n_u), or null for zero
   const double* lam_start;  // (count, H, n_lam), or null for the root of the first relaxation
   const double* mu_start;   // (count, H + 1, n_c), or null for zero
@@ -82,12 +90,7 @@ struct MpcSolve {
   double tol;               // on the projected gradient
   int64_t max_iter;
   double certified;  // largest residual of a solved problem
-  double *x, *u, *lam, *mu, *objective,
-      *residual;    // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
-  double* gained;   // (count,) out: what the last step at the target has saved
-  int8_t* status;   // out; unreached where the watch stopped before
-  int8_t* fragile;  // out; whether elimination without row exchanges lost digits
-  int32_t* iterations;
+  double* gained;    // (count,) out: what the last step at the target has saved
 };
 
 // Upstream gradients of the outputs, and the gradients of the inputs.

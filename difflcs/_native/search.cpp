@@ -169,21 +169,12 @@ struct Solving {
 };
 
 MpcSolve solver_options(const MpcEffort& effort, const MpcPlans& out) {
-  MpcSolve o{};
+  MpcSolve o{out};
   o.shrink = effort.shrink;
   o.steps = kSteps;
   o.tol = effort.tol;
   o.max_iter = effort.max_iter;
   o.certified = effort.certified;
-  o.x = out.x;
-  o.u = out.u;
-  o.lam = out.lam;
-  o.mu = out.mu;
-  o.objective = out.objective;
-  o.residual = out.residual;
-  o.status = out.status;
-  o.fragile = out.fragile;
-  o.iterations = out.iterations;
   return o;
 }
 

@@ -24,13 +24,6 @@ struct MpcGuess {
   const double *u, *lam, *mu;
 };
 
-// Outputs of a batch.
-struct MpcPlans {
-  double *x, *u, *lam, *mu, *objective, *residual;
-  int8_t *status, *fragile;
-  int32_t* iterations;
-};
-
 // Runs work on one thread or on several, each with a separate workspace, until it is done or the time is over.
 // `to_the_end`: whatever the time.
 struct Runner {
