@@ -238,7 +238,7 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
         raise CheckpointError(f"{directory}: corrupt or not a checkpoint ({error.args[0]}); {remedy}") from error
     if not isinstance(header, dict) or header.get("kind") != kind or not isinstance(header.get("config"), dict):
         got = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise CheckpointError(f"{directory}: expected a record of kind {kind!r}, got {short(got)}; {remedy}")
+        raise CheckpointError(f"{directory}: expected a record of kind {kind!r}, got {short(got)}; use its own loader")
     if header.get("format") != _FORMAT:
         got = short(header.get("format"))
         raise CheckpointError(f"{directory}: expected format {_FORMAT}, got {got}; update difflcs or save it again")

@@ -46,7 +46,7 @@ class Reader {
       refuse("expected version " + std::to_string(kControllerVersion) + " of the format, got " +
              std::to_string(version) + ", which another difflcs has written");
     if (whole != size)
-      refuse("expected " + std::to_string(whole) + " bytes, got " + std::to_string(size) + ": the file was cut");
+      refuse("expected " + std::to_string(whole) + " bytes, got " + std::to_string(size) + ": the file was cut or grew");
     if (crc32(at_ + 16, size - 16) != little_endian(at_ + 12, 4))
       refuse("the checksum does not match: the file is damaged");
     at_ += kHeader;

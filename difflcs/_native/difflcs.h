@@ -97,7 +97,7 @@ DIFFLCS_API difflcs_status difflcs_follow(difflcs_controller* controller, const 
 /* Forgets all plans, as at the begin of an episode. */
 DIFFLCS_API void difflcs_reset(difflcs_controller* controller);
 
-/* How the last step went. */
+/* How the last step went; MAX_ITER and zeros before the first. */
 DIFFLCS_API difflcs_outcome difflcs_get_outcome(const difflcs_controller* controller);
 DIFFLCS_API difflcs_plan difflcs_get_plan(const difflcs_controller* controller);
 

@@ -79,7 +79,7 @@ difflcs_controller* difflcs_load(const char* path, char* error, size_t size) {
   if (!file) return fail("expected a file that can be read");
   if (std::fseek(file.get(), 0, SEEK_END) != 0) return fail("expected a plain file");
   const long length = std::ftell(file.get());
-  if (length < 0 || length > kLargestFile) return fail("expected a controller file, got a larger one");
+  if (length < 0 || length > kLargestFile) return fail("expected a controller file, got a folder or a larger file");
   std::rewind(file.get());
   try {
     std::vector<unsigned char> bytes(static_cast<size_t>(length) + 1);

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs import _storage
-from difflcs._checks import check_array, check_finite, check_number, describe
+from difflcs._checks import check_array, check_finite, check_number, describe, to_tensor
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-from difflcs.constraints import check_bounds
+from difflcs.constraints import StageBounds, check_bounds
 from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, InvalidInputError, NonFiniteError, ShapeError, SolveError
 from difflcs.mpc.controller_file import (
@@ -28,7 +28,7 @@ from difflcs.mpc.controller_file import (
     make_problem,
     numbers_of_one,
 )
-from difflcs.mpc.setup import PLAIN_COSTS, Bound, Call, Cost, Inputs, Setup, System, gather
+from difflcs.mpc.setup import PLAIN_COSTS, Call, Cost, Inputs, Setup, System, gather
 from difflcs.records import SYSTEM, LCSParams, LCSSequence
 from difflcs.status import Status
 
@@ -200,11 +200,12 @@ class MPCController:
         goal: ArrayLike | None = None,
         reference: ArrayLike | None = None,
         *,
-        context: Tensor | None = None,
+        context: ArrayLike | None = None,
         lcs: System | None = None,
         cost: Cost | None = None,
-        u_min: Bound | None = None,
-        u_max: Bound | None = None,
+        bounds: StageBounds | None = None,
+        u_min: ArrayLike | None = None,
+        u_max: ArrayLike | None = None,
     ) -> NDArray[np.float64]:
         """Plan from a state.
 
@@ -215,7 +216,8 @@ class MPCController:
             context: (n_context,) quantities besides x that system or cost depend on; passed to the modules.
             lcs: system for this step, or a module that returns one, of the same sizes as the layer's.
             cost: cost for this step, likewise; no `GoalCost`, and none if the layer has one.
-            u_min: bound for this step, (n_u,), or by stage if the layer's are.
+            bounds: bounds by stage for this step, if the layer's are by stage.
+            u_min: bound for this step, (n_u,), or a number.
             u_max: likewise.
 
         Returns:
@@ -239,9 +241,10 @@ class MPCController:
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
-        update = bool(self._modules) or self._overridden or not (lcs is cost is u_min is u_max is None)
+        update = bool(self._modules) or self._overridden or not (lcs is cost is bounds is u_min is u_max is None)
         if update:
-            x = self._update(x, goal, context, {"lcs": lcs, "cost": cost, "u_min": u_min, "u_max": u_max})
+            own = {"lcs": lcs, "cost": cost, "bounds": bounds, "u_min": to_tensor(u_min), "u_max": to_tensor(u_max)}
+            x = self._update(x, goal, to_tensor(context), own)
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
@@ -254,7 +257,7 @@ class MPCController:
         return u
 
     def _update(
-        self, x: NDArray[np.float64], goal: ArrayLike | None, context: Tensor | None, overrides: dict[str, Any]
+        self, x: NDArray[np.float64], goal: ArrayLike | None, context: Any, overrides: dict[str, Any]
     ) -> NDArray[np.float64]:
         """Update the native controller from the modules and a step's arguments; return the state to plan from."""
         if self._setup is None:
@@ -290,7 +293,10 @@ class MPCController:
             if part in self._modules or overrides[part] is not None or part in ("u_min", "u_max"):
                 fields |= {n: values[n] if n in values else torch.zeros_like(self._first_inputs[n]) for n in names}
             for name in names:
-                if fields[name].numel() != (first := self._first_inputs[name]).numel():
+                first = self._first_inputs[name]
+                if name in ("u_min", "u_max") and fields[name].ndim < first.ndim:  # one for all stages
+                    fields[name] = fields[name].expand_as(first).contiguous()
+                if fields[name].numel() != first.numel():
                     raise ShapeError(
                         f"{part}: expected {name} {tuple(first.shape)} as in the first step, got "
                         f"{tuple(fields[name].shape)}; make another controller"

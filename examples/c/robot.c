@@ -27,11 +27,15 @@ static long read_rows(const char* path, size_t columns, double** rows) {
   long count = 0;
   size_t room = 0;
   FILE* file = fopen(path, "r");
-  if (!file) return -1;
   *rows = NULL;
+  if (!file) {
+    fprintf(stderr, "%s: expected a file that can be read\n", path);
+    return -1;
+  }
   while (fgets(line, sizeof line, file)) {
     char* at = line;
-    if (count++ == 0) continue; /* the names */
+    if (count > 0 && line[strspn(line, " \t\r\n")] == '\0') continue; /* an empty line, as at the end */
+    if (count++ == 0) continue;                                       /* the names */
     if ((size_t)count > room) {
       double* larger = realloc(*rows, (room = 2 * (size_t)count) * columns * sizeof(double));
       if (!larger) break;
@@ -41,14 +45,20 @@ static long read_rows(const char* path, size_t columns, double** rows) {
       char* end;
       (*rows)[(size_t)(count - 2) * columns + i] = strtod(at, &end);
       if (end == at) {
-        fprintf(stderr, "%s: expected %zu numbers in line %ld, got %zu\n", path, columns, count, i);
+        fprintf(stderr, "%s: expected %zu numbers in row %ld, got %zu\n", path, columns, count - 1, i);
         fclose(file);
         return -1;
       }
       at = end + (*end == ',');
     }
+    if (at[strspn(at, " \t\r\n")] != '\0') {
+      fprintf(stderr, "%s: expected %zu numbers in row %ld, got more\n", path, columns, count - 1);
+      fclose(file);
+      return -1;
+    }
   }
   fclose(file);
+  if (count < 2) fprintf(stderr, "%s: expected a line of names, and rows of %zu numbers\n", path, columns);
   return count - 1;
 }
 
@@ -90,13 +100,18 @@ int main(int argc, char** argv) {
   char error[256];
   long steps = 0;
   double time_limit = 0, *rows = NULL;
-  if (argc < 3) {
+  int usable = argc >= 3 && argc % 2 == 1;
+  for (int i = 3; usable && i < argc; i += 2) {
+    if (strcmp(argv[i], "--bench") == 0)
+      usable = (steps = atol(argv[i + 1])) > 0;
+    else if (strcmp(argv[i], "--time-limit") == 0)
+      usable = (time_limit = atof(argv[i + 1])) > 0;
+    else
+      usable = 0;
+  }
+  if (!usable) {
     fprintf(stderr, "usage: %s controller.difflcs trajectory.csv [--time-limit SECONDS] [--bench STEPS]\n", argv[0]);
     return 2;
-  }
-  for (int i = 3; i + 1 < argc; i += 2) {
-    if (strcmp(argv[i], "--bench") == 0) steps = atol(argv[i + 1]);
-    if (strcmp(argv[i], "--time-limit") == 0) time_limit = atof(argv[i + 1]);
   }
   difflcs_controller* controller = difflcs_load(argv[1], error, sizeof error);
   if (!controller) {
@@ -108,8 +123,7 @@ int main(int argc, char** argv) {
   const long count = read_rows(argv[2], n.n_x + n.n_goal, &rows);
   double* u = malloc(n.n_u * sizeof(double));
   if (count < 1 || !u) {
-    fprintf(stderr, "%s: expected a line of names, and rows with %zu states and %zu numbers of a goal\n", argv[2],
-            n.n_x, n.n_goal);
+    fprintf(stderr, "%s: a row has %zu states and %zu numbers of a goal\n", argv[2], n.n_x, n.n_goal);
     return 1;
   }
   int code = 0;

@@ -166,14 +166,18 @@ class Tilted:
 @pytest.mark.parametrize("asked", ["both", "cost", "given"])
 def test_each_step_may_have_a_system_a_cost_and_bounds_of_its_own(build, asked):
     lcs = Leaning(build.params(0)) if asked == "both" else build.params(0)
-    mpc = LCSMPCLayer(lcs, build.cost(0) if asked == "given" else Tilted(build.cost(0)), H, -0.3, 0.3)
+    stages = StageBounds(np.linspace(-0.3, -0.1, 2 * H).reshape(H, 2), 0.3, by_stage=("u_min",))
+    limits = {"bounds": stages} if asked == "given" else {"u_min": -0.3, "u_max": 0.3}
+    mpc = LCSMPCLayer(lcs, build.cost(0) if asked == "given" else Tilted(build.cost(0)), H, **limits)
     controller, solution = mpc.eval().controller(time_limit=100.0), None
     for i, x in enumerate(states(8)):
-        context, own = torch.tensor([1.0 + 0.1 * i]).double() if asked == "both" else None, {}
+        context, own = np.array([1.0 + 0.1 * i]) if asked == "both" else None, {}
         goal = None if asked == "given" or i == 3 else 0.1 * torch.from_numpy(x)
         if i % 3 == 1:  # what is given counts for this step alone
-            low = torch.tensor([-0.02, -0.3 - 0.1 * i], dtype=torch.float64)
+            low = np.array([-0.02, -0.3 - 0.1 * i])
             own = {"lcs": build.params(i), "cost": Tilted(build.cost(i)), "u_min": low, "u_max": 0.01}
+        if asked == "given" and i == 6:
+            own = {"bounds": StageBounds(stages.u_min / (i + 1), 0.2, by_stage=("u_min",))}
         guess = None if solution is None else solution.shift()
         solution = mpc(torch.from_numpy(x), goal, guess=guess, context=context, **own)
         assert np.array_equal(controller.step(x, goal, context=context, **own), solution.action.numpy())
