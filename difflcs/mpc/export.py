@@ -1,5 +1,6 @@
 """Export of a controller for a robot without Python: its file, and a description of the numbers in it."""
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,13 +43,17 @@ def export_controller(
     """
     if not isinstance(mpc, LCSMPCLayer):
         raise InvalidInputError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; pass the layer of the controller")
+    try:
+        further = json.loads(json.dumps(about or {}, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"about: expected finite values in JSON types, got: {error}; convert them") from error
     setup = constant_setup(mpc.setup())
     check_constant(setup)
     problem, constant = make_problem(setup, gather_at_zero(setup))
     content = controller_bytes(setup, problem, constant, step_seconds)
     low, high = mpc.limits()
     description = {
-        **(about or {}),
+        **further,
         "format": VERSION,
         "difflcs": __version__,
         "file": CONTROLLER,
