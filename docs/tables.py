@@ -196,6 +196,12 @@ def machine(record: dict) -> str:
     )
 
 
+def processor(record: dict) -> str:
+    """What the times of a record were measured on."""
+    at = record["machine"]
+    return f"Times are of one core of an {at['cpu']} with the instruction set {at['instruction set']}."
+
+
 def efforts(record: dict) -> str:
     """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time over the first."""
     names = ("fast", "default", "best")
@@ -508,10 +514,10 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
-    "latency": {"ways": latency, "deadlines": deadlines, "decision": decision},
+    "latency": {"ways": latency, "deadlines": deadlines, "decision": decision, "processor": processor},
     "objects": {"success": objects, "methods": methods},
-    "physics_models": {"summary": summary, "models": foreign},
-    "box_to_pose": {"success": success},
+    "physics_models": {"summary": summary, "models": foreign, "processor": processor},
+    "box_to_pose": {"success": success, "processor": processor},
     "pusht": {"variants": pusht, "published": published, "scoreboards": scoreboards},
     "cylinder_push": {"planners": cylinder},
 }

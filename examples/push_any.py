@@ -1,4 +1,4 @@
-"""Every shape of gym-pushany by sampling-based contact MPC: `python examples/push_any.py --shape 4 --obstacles 2`.
+"""Policy for every shape of gym-pushany, by sampling-based contact MPC; `benchmarks/scoreboard/pushany.py` plays it.
 
 The environment (gym-pushany, pip) is Push-T with 21 shapes, goals anywhere and up to four other bodies in the way. The
 policy is that of Push-T with the outline, mass and moment of the body, and the outlines and poses of what is in the

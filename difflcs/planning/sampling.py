@@ -245,8 +245,8 @@ class SamplingPolicy:
         price = settings.switch_price + settings.travel_price * self.travel.distance(state, states[1:])
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
         best, here = float(scores.max()), float(gains[0])
-        pushes = self.places.near(state) and here > settings.smallest_gain * scale and here >= settings.keep * best
-        pushes = pushes and self._moves(standing)
+        pushes = here > settings.smallest_gain * scale and here >= settings.keep * best
+        pushes = pushes and self.places.near(state) and self._moves(standing)
         chosen = 0 if stay or pushes else self._choose(states, scores, standing)
         self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
         target = states[chosen] if chosen else None
