@@ -130,6 +130,7 @@ def trifinger_turn(o: Options) -> None:
     frames = []
     for name in ("cube", "mug"):
         model, servos, data, place, goal = turning.make_task(o.assets, name, 5000)
+        model.body("goal").pos[:], model.body("goal").quat[:] = place, goal
         policy, held = turning.Policy(servos, data, place, goal, turning.Settings()), 0
         camera = Camera(model, (0.0, 0.0, 0.03), 0.55, 90.0, -40.0)
         for step in range(turning.DECISIONS):
