@@ -1,5 +1,6 @@
 """The commands for training: `difflcs train`, whose flags are the settings of its method, and `difflcs demo`."""
 
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -51,7 +52,7 @@ class Train(TrainConfig):
             run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in sum_seconds(run.rows()).items() if seconds)
         print(f"time: {spent}")
-        print(f"finished: {run.path}\nevaluate it with: {self.program} evaluate {run.path}")
+        print(f"finished: {run.path}\nevaluate it with: {self.program} evaluate {shlex.quote(str(run.path))}")
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
@@ -70,8 +71,8 @@ class Train(TrainConfig):
     def interrupted(self) -> str:
         """Return the advice after Ctrl-C."""
         out = self.directory(self.out)
-        begun = (out / "config.json").is_file()
-        return f"continue with: {self.program} train --out {out} --resume" if begun else "nothing was changed"
+        begun, name = (out / "config.json").is_file(), shlex.quote(str(out))
+        return f"continue with: {self.program} train --out {name} --resume" if begun else "nothing was changed"
 
     @property
     def program(self) -> str:

@@ -230,18 +230,18 @@ def test_ctrl_c_while_the_command_is_imported(capsys, monkeypatch):
 
 def test_what_a_training_shows_without_a_terminal(capsys, tmp_path):
     words = "--method violation --smoke --minutes 0.5 --evaluate-at 0 0.3 --evaluate-goals 2 --final-goals 3".split()
-    code, out, err = run(capsys, "train", *words, "--out", tmp_path / "run")
+    code, out, err = run(capsys, "train", *words, "--out", tmp_path / "my run")
     assert code == 0
     lines = err.splitlines()
-    assert lines[0] == f"training: violation on cube, 0.5 min of data, in {tmp_path / 'run'}"
+    assert lines[0] == f"training: violation on cube, 0.5 min of data, in {tmp_path / 'my run'}"
     shown = [line for line in lines if line.startswith("iteration ")]
     assert shown[0].startswith("iteration 1, 0.2 of 0.5 min of data, loss ")
-    assert len(shown) == len(RunDirectory.open(tmp_path / "run").rows()) - 1
+    assert len(shown) == len(RunDirectory.open(tmp_path / "my run").rows()) - 1
     assert [line for line in lines if line.startswith("evaluating")] == [f"evaluating {n} goals" for n in (3, 2, 3)]
     assert [line.partition(":")[0] for line in lines if line.startswith("after")] == [
         f"after {minutes} min of data" for minutes in ("0.0", "0.3", "0.5")
     ]
-    assert f"evaluate it with: difflcs evaluate {tmp_path / 'run'}" in out
+    assert f"evaluate it with: difflcs evaluate '{tmp_path / 'my run'}'" in out
     registered = type("Mine", (ViolationMethod,), {"__module__": "__main__"})()
     assert cli_train.Train(method=registered).program == f"python {sys.argv[0]}"
     assert logging.getLogger("difflcs").handlers == [difflcs_handler()]
