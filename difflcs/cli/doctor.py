@@ -138,7 +138,7 @@ def as_text(checks: Sequence[Check], width: int = 100) -> str:
         for check in members:
             lines += wrap.wrap(f"  {_MARKS[check.status]}  {check.name:<12} {check.text}")
             lines += wrap.wrap(f"{'':<19}→ {check.remedy}") * bool(check.remedy)
-    rest = [check.name for check in checks if check.status != "ok" and not check.core]
+    rest = list(dict.fromkeys(check.name for check in checks if check.status != "ok" and not check.core))
     verdict = "The library works" if healthy(checks) else "The library does NOT work, see the lines with !!"
     return "\n".join([*lines, verdict + (f"; not here: {', '.join(rest)}." if rest else ".")])
 

@@ -66,7 +66,7 @@ class Orientation(_Squares):
 
     Attributes:
         of: its name, as for `Position`.
-        goal: (4,) quaternion w, x, y, z of any length; None: that of each call.
+        goal: (4,) quaternion w, x, y, z of any length, zero for no rotation; None: that of each call.
         reach: angle [rad] beyond which a goal pulls no harder; None: no limit.
     """
 
