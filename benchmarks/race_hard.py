@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,33 +34,24 @@ OURS: dict[str, dict[str, Any]] = {
 Draw = Callable[[np.random.Generator], dict[str, Any]]
 
 
-def sampled(methods: tuple[str, ...], rollouts: int) -> Draw:
+def sampled(random: np.random.Generator, methods: tuple[str, ...], rollouts: int) -> dict[str, Any]:
     """Draw settings of one of these methods with so many rollouts."""
-
-    def draw(random: np.random.Generator) -> dict[str, Any]:
-        iterations = int(random.choice([n for n in (1, 2, 4, 8, 16, 32) if rollouts // n >= 4]))
-        method = str(random.choice(methods))
-        keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
-        spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
-        how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
-        return {**how, "spread": spread, "hold": hold, "keep": keep}
-
-    return draw
+    iterations = int(random.choice([n for n in (1, 2, 4, 8, 16, 32) if rollouts // n >= 4]))
+    method = str(random.choice(methods))
+    keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
+    spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
+    how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
+    return {**how, "spread": spread, "hold": hold, "keep": keep}
 
 
 def draws() -> dict[str, tuple[str, Draw]]:
     """List the rivals whose settings are tuned: module, and how random settings are drawn."""
 
-    def consensus(iterations: int, **fixed: str) -> Draw:
-        def draw(random: np.random.Generator) -> dict[str, Any]:
-            growth = float(random.choice([1.0, 1.0, 1.05, 1.1, 1.2, 1.5, 2.0][: 7 if iterations <= 30 else 4]))
-            weight, gap, action, prefer = (
-                float(10 ** random.uniform(*v)) for v in [(-3, 3.5), (-2, 2), (-3, 2), (-1, 2)]
-            )
-            numbers = {"weight": weight, "growth": growth, "gap": gap, "action": action, "prefer": prefer}
-            return {**fixed, "iterations": iterations, **numbers}
-
-        return draw
+    def consensus(random: np.random.Generator, iterations: int, **fixed: str) -> dict[str, Any]:
+        growth = float(random.choice([1.0, 1.0, 1.05, 1.1, 1.2, 1.5, 2.0][: 7 if iterations <= 30 else 4]))
+        weight, gap, action, prefer = (float(10 ** random.uniform(*v)) for v in [(-3, 3.5), (-2, 2), (-3, 2), (-1, 2)])
+        numbers = {"weight": weight, "growth": growth, "gap": gap, "action": action, "prefer": prefer}
+        return {**fixed, "iterations": iterations, **numbers}
 
     def lagrangian(random: np.random.Generator) -> dict[str, Any]:
         weight, bound, settle = (float(10 ** random.uniform(*v)) for v in [(-2, 3.5), (-1, 4), (-4, -2)])
@@ -67,11 +59,12 @@ def draws() -> dict[str, tuple[str, Draw]]:
         numbers = {"weight": weight, "bound": bound, "growth": growth, "progress": progress}
         return {**numbers, "inner": int(random.choice([5, 10, 50])), "settle": settle}
 
-    rivals = {f"C3+, {n} iterations": ("admm", consensus(n)) for n in ITERATIONS}
-    rivals["C3, 10 iterations"] = ("admm", consensus(10, project="lcp"))
-    rivals["C3, 10 iterations, exact"] = ("admm", consensus(10, project="exact"))
+    rivals = {f"C3+, {n} iterations": ("admm", partial(consensus, iterations=n)) for n in ITERATIONS}
+    rivals["C3, 10 iterations"] = ("admm", partial(consensus, iterations=10, project="lcp"))
+    rivals["C3, 10 iterations, exact"] = ("admm", partial(consensus, iterations=10, project="exact"))
     rivals["IMPACT-like"] = ("impact", lagrangian)
-    return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled((m,), 1024)) for m in ("cem", "mppi")}
+    drawn = {m: partial(sampled, methods=(m,), rollouts=1024) for m in ("cem", "mppi")}
+    return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", draw) for m, draw in drawn.items()}
 
 
 def objectives(problem: Problem, u: np.ndarray) -> np.ndarray:

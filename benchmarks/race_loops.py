@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -303,11 +304,14 @@ TASKS: dict[str, Callable[[], Loop]] = {"cube": Cube, "box": Box, "hand": Hand}
 def rivals(task: str) -> dict[str, tuple[str, Draw]]:
     """List the rivals of a task: module, and how random settings are drawn."""
     lcs, simulated = ROLLOUTS[task]
-    both, out = ("cem", "mppi"), ("C3+, 100 iterations", *LEFT_OUT[task])
+    draw, out = partial(sampled, methods=("cem", "mppi")), ("C3+, 100 iterations", *LEFT_OUT[task])
     found = {label: row for label, row in draws().items() if row[0] != "sampling" and label not in out}
-    found[f"sampling on the LCS, {lcs} rollouts"] = ("sampling", sampled(both, lcs))
+    found[f"sampling on the LCS, {lcs} rollouts"] = ("sampling", partial(draw, rollouts=lcs))
     if simulated:
-        found[f"sampling in MuJoCo, {simulated} rollouts"] = ("simulated", sampled(both, simulated))
+        found[f"sampling in MuJoCo, {simulated} rollouts"] = (
+            "simulated",
+            partial(draw, rollouts=simulated),
+        )
     return found
 
 

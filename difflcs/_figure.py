@@ -1,26 +1,25 @@
 """A figure as wide as a page, legible on a phone; imported where something is drawn, as matplotlib may be missing."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
-from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.figure import Figure
-
-FONT: dict[Any, Any] = {"font.size": 12}
-"""Settings of matplotlib to draw with: `with rc_context(FONT)`."""
 
 
 class PageFigure(Figure):
-    """A figure 7 inches wide, which a notebook shows, whether pyplot was imported or not.
-
-    Args:
-        height: [inches].
-    """
-
-    def __init__(self, height: float):
-        super().__init__(figsize=(7.0, height), dpi=150, layout="constrained")
+    """A figure 7 inches wide, which a notebook shows, whether pyplot was imported or not."""
 
     def _repr_png_(self) -> bytes:
         return to_png(self)
+
+
+@contextmanager
+def page_figure() -> Iterator[PageFigure]:
+    """Make a figure; what is drawn on it meanwhile has its font."""
+    with rc_context({"font.size": 12}):
+        yield PageFigure(figsize=(7.0, 6.5), dpi=150, layout="constrained")
 
 
 def to_png(figure: Figure) -> bytes:

@@ -22,10 +22,12 @@ def require(*packages: str) -> None:
 
 def versions() -> dict[str, str | None]:
     """List the versions of the packages that decide a result; None for one that is not installed."""
-    installed: dict[str, str | None] = {}
-    for name in _REPORTED:
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            installed[name] = None
-    return installed
+    return {name: version(name) for name in _REPORTED}
+
+
+def version(package: str) -> str | None:
+    """Return the version of a package, or None if it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

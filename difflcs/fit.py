@@ -159,12 +159,9 @@ class FitReport:
     def plot(self) -> Figure:
         """Draw the three tables; needs matplotlib."""
         require("matplotlib")
-        from matplotlib import rc_context
+        from difflcs._figure import page_figure
 
-        from difflcs._figure import FONT, PageFigure
-
-        with rc_context(FONT):
-            figure = PageFigure(6.5)
+        with page_figure() as figure:
             panels = figure.subplot_mosaic([["states", "forces"], ["steps", "steps"]])
             states, forces, steps = panels["states"], panels["forces"], panels["steps"]
             place = np.arange(len(self.error))

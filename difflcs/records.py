@@ -223,11 +223,14 @@ class _Record(SystemMatrices):
     def _fits(self, **batches: torch.Size) -> torch.Size:
         return broadcast_batch([("the system", self.batch_shape), *batches.items()])
 
-    def _check_rollout(self, x0: Tensor, u_seq: Tensor, horizon: int | None = None) -> torch.Size:
-        sizes = {"n_u": self.n_u} if horizon is None else {"n_u": self.n_u, "T": horizon}
-        check_shape("u_seq", u_seq, "... T n_u", sizes, "give one action for each step")
+    def _rollout(self, x0: Tensor, u_seq: Tensor, stage: Callable[[int], LCSParams], **horizon: int) -> Tensor:
+        """Predict a trajectory by the system of each step; T=… if it has a number of its own."""
+        check_shape("u_seq", u_seq, "... T n_u", {"n_u": self.n_u, **horizon}, "give one action for each step")
         self.check_inputs(x0=x0, u_seq=u_seq)
-        return self._fits(x0=x0.shape[:-1], u_seq=u_seq.shape[:-2])
+        states = [x0.expand(*self._fits(x0=x0.shape[:-1], u_seq=u_seq.shape[:-2]), self.n_x)]
+        for t in range(u_seq.shape[-2]):
+            states.append(advance(stage(t), states[-1], u_seq[..., t, :]).x_next)
+        return torch.stack(states, dim=-2)
 
 
 @dataclass(frozen=True, repr=False)
@@ -283,11 +286,7 @@ class LCSParams(_Record):
         Returns:
             (..., T+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
         """
-        batch = self._check_rollout(x0, u_seq)
-        states = [x0.expand(*batch, self.n_x)]
-        for t in range(u_seq.shape[-2]):
-            states.append(advance(self, states[-1], u_seq[..., t, :]).x_next)
-        return torch.stack(states, dim=-2)
+        return self._rollout(x0, u_seq, lambda _: self)
 
 
 @dataclass(frozen=True, repr=False)
@@ -367,11 +366,7 @@ class LCSSequence(_Record):
         Returns:
             (..., H+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
         """
-        batch = self._check_rollout(x0, u_seq, self.horizon)
-        states = [x0.expand(*batch, self.n_x)]
-        for k in range(self.horizon):
-            states.append(advance(self.stage(k), states[-1], u_seq[..., k, :]).x_next)
-        return torch.stack(states, dim=-2)
+        return self._rollout(x0, u_seq, self.stage, T=self.horizon)
 
 
 @runtime_checkable

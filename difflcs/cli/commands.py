@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -87,8 +86,9 @@ class Bench:
     def run(self) -> None:
         """Run the command."""
         from difflcs.cli import bench
+        from difflcs.mpc.backends.ipopt import usable_cpus
 
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = usable_cpus()
         sizes = (16, 2, 1) if self.smoke else (self.batch, self.ipopt_batch, self.repeats)
         timings = bench.measure(*sizes, threads=threads)
         if self.json:

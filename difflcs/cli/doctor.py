@@ -24,8 +24,10 @@ import torch
 
 import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, solve_lcp, zoo
+from difflcs._optional import version
 from difflcs._storage import load_record, read_json
 from difflcs.errors import BackendNotFoundError, DiffLCSError
+from difflcs.mpc.backends.ipopt import usable_cpus
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
 """Groups of checks for users, in the order of the report."""
@@ -227,9 +229,8 @@ def _solves(name: str) -> str:
 
 
 def _threads() -> str:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     variable = os.environ.get("OMP_NUM_THREADS")
-    return f"{usable} of {os.cpu_count()} cores usable" + (f", OMP_NUM_THREADS={variable}" if variable else "")
+    return f"{usable_cpus()} of {os.cpu_count()} cores usable" + (f", OMP_NUM_THREADS={variable}" if variable else "")
 
 
 def _devices() -> str:
@@ -248,23 +249,16 @@ def _extra(name: str) -> str:
     for line in wanted:
         match = re.match(r"[\w.-]+", line)
         package = match[0] if match else line
-        version, least = _version(package), re.search(r">=\s*([\w.]+)", line)
-        if version is None:
+        found, least = version(package), re.search(r">=\s*([\w.]+)", line)
+        if found is None:
             lacking.append(package)
-        elif least and _release(version) < _release(least[1]):
-            lacking.append(f"{package} >= {least[1]} (found {version})")
+        elif least and _release(found) < _release(least[1]):
+            lacking.append(f"{package} >= {least[1]} (found {found})")
         else:
-            present.append(f"{package} {version}")
+            present.append(f"{package} {found}")
     if lacking:
         raise _MissingError(f"for {_EXTRAS[name]}: without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
     return f"{_EXTRAS[name]}: {', '.join(present)}"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _release(version: str) -> tuple[int, ...]:
@@ -295,7 +289,7 @@ def _pictures() -> str:
 
 
 def _video() -> str:
-    if _version("imageio-ffmpeg") is None:
+    if version("imageio-ffmpeg") is None:
         raise _MissingError("without imageio-ffmpeg", 'pip install "difflcs[viz]"')
     import imageio_ffmpeg
 
@@ -315,7 +309,7 @@ def _meshes(state: dict[str, bool | None], folder: str) -> str:
 
 
 def _in_process(code: str) -> dict[str, Any]:
-    if any(_version(package) is None for package in ("gymnasium", "mujoco")):
+    if any(version(package) is None for package in ("gymnasium", "mujoco")):
         raise _MissingError("without gymnasium and mujoco", 'pip install "difflcs[envs]"')
     command = [sys.executable, "-c", code]
     try:

@@ -165,12 +165,9 @@ class MPCSolution:
 def draw_trajectory(x: Tensor, u: Tensor, lam: Tensor, gap: Tensor, bounds: Sequence[Tensor], title: str) -> Figure:
     """Draw states (T+1, n_x), actions (T, n_u) between bounds of their shape, forces and gaps (T, n_lam)."""
     require("matplotlib")
-    from matplotlib import rc_context
+    from difflcs._figure import page_figure
 
-    from difflcs._figure import FONT, PageFigure
-
-    with rc_context(FONT):
-        figure = PageFigure(6.5)
+    with page_figure() as figure:
         panels = figure.subplots(2, 2, sharex=True).flat
         parts = {"states x": x, "actions u": u, "forces λ": lam, "gaps": gap}
         for axes, (name, values) in zip(panels, parts.items(), strict=True):

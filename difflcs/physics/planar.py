@@ -363,6 +363,15 @@ class PlanarPushing:
         cos, sin = yaw.cos(), yaw.sin()
         return torch.stack([cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]], -1)
 
+    def _mobility(self, x: Tensor) -> Tensor:
+        """Compute the mobility (..., 3, 3): the motion of the pose by a force and a torque dual to it, for mass 1."""
+        cx, cy = self._center_offset(x[..., 2]).unbind(-1)
+        # The pose is that of the body's origin, which turns about the centre of mass.
+        turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
+        gyration: Any = self.gyration
+        plane = torch.diag(x.new_tensor([1.0, 1.0, 0.0]))
+        return plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
+
     def _without_contact(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Compute A and B, and the response of the discs alone."""
         numbers = _plain_numbers(self.drive, self.inertia)
@@ -397,13 +406,7 @@ class PlanarPushing:
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
         A, B, response = self._without_contact(x)
-        cx, cy = self._center_offset(x[..., 2]).unbind(-1)
-        # The pose is that of the body's origin, which turns about the centre of mass.
-        turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
-        gyration: Any = self.gyration
-        plane, rest = torch.diag(x.new_tensor([1.0, 1.0, 0.0])), self.n_x - 3
-        # Motion of the pose (..., 3, 3) by a force and a torque dual to it, for mass 1.
-        mobility = plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
+        mobility, rest = self._mobility(x), self.n_x - 3
         if self.inertia is None:
             return FreeMotion(A, B, x.new_zeros(self.n_x), response + pad(mobility, (0, rest, 0, rest)))
         h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)

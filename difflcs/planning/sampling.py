@@ -212,9 +212,7 @@ class SamplingPolicy:
                 self._steps += 1
                 towards = self.places.states(state, place.unsqueeze(0))[0]
                 if self._steps <= self.settings.patience and not self.travel.arrived(state, towards):
-                    assert self._decision is not None
-                    self._decision = replace(self._decision, mode=Mode.TRAVEL, began=False, target=towards)
-                    return self.travel.action(state, towards).numpy()
+                    return self._continue_journey(state, towards)
             return self._decide(state, target, context, stay=place is not None)
 
     def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
@@ -231,6 +229,12 @@ class SamplingPolicy:
         for index in self.angles:
             target[index] += 2 * math.pi * torch.round((state[index] - target[index]) / (2 * math.pi))
         return state, target
+
+    def _continue_journey(self, state: Tensor, towards: Tensor) -> NDArray[np.float64]:
+        """Take the next step of a journey."""
+        assert self._decision is not None
+        self._decision = replace(self._decision, mode=Mode.TRAVEL, began=False, target=towards)
+        return self.travel.action(state, towards).numpy()
 
     def _decide(self, state: Tensor, goal: Tensor | None, context: Tensor | None, stay: bool) -> NDArray[np.float64]:
         """Compare all places. `stay`: a journey has just ended, and at least one push comes first."""

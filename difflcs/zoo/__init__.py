@@ -102,20 +102,19 @@ def names(root: Path = MODELS) -> tuple[str, ...]:
     return tuple(sorted(card.parent.name for card in root.glob("[!._]*/card.json")))
 
 
-def path(name: str, root: Path = MODELS) -> Path:
+def path(name: str) -> Path:
     """Return the folder of a model, with the files of `LCSModel.save_pretrained` and card.json.
 
     Args:
         name: "trifinger-cube" or "zoo:trifinger-cube".
-        root: folder of the models.
 
     Raises:
         CheckpointError: no model has this name; the message lists those there are.
     """
     name = name.removeprefix(PREFIX)
-    known = names(root)
+    known = names()
     if name in known:
-        return root / name
+        return MODELS / name
     advice = f"`difflcs zoo` lists them{did_you_mean(name, known)}"
     raise CheckpointError(f"zoo: expected one of {', '.join(known) or 'no models'}, got {name!r}; {advice}")
 

@@ -126,8 +126,7 @@ class IpoptBackend(Backend):
         mu_init = self.mu_init_warm if warm else self.mu_init
         options = Options(self.tol, self.max_iter, mu_init, P.barrier > 0, slack, elastic)
         chunk = self._start(problem, guess, elastic)
-        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = min(self.workers or usable, problem.batch)
+        workers = min(self.workers or usable_cpus(), problem.batch)
         if workers <= 1:
             with _locals.here:
                 solved = solve_chunk(sizes, options, chunk)
@@ -336,6 +335,11 @@ class _Pool:
     def _replace(self, slot: int) -> None:
         self.workers[slot].close()
         self.workers[slot] = _Worker()
+
+
+def usable_cpus() -> int:
+    """Count the CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_pids() -> tuple[int, ...]:

@@ -88,10 +88,9 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
         text = _KINDS.get(kind, f"model: expected no warning of MuJoCo, got its number {kind}; see MUJOCO_LOG.TXT")
     else:
         text = _MEMORY if "Alloc" in str(said) else f"model: expected what MuJoCo can compute, got its error {said}"
-    kept = {name: getattr(data, name).copy() for name in TAKEN}
+    kept = taken(data)
     mujoco.mj_resetData(model, data)  # what an error leaves behind, such as a stack that was not given back
-    for name, values in kept.items():
-        getattr(data, name)[:] = values
+    copy_taken(data, kept)
     raise InvalidInputError(f"{text.format(**size)} ({where})") from said
 
 

@@ -25,7 +25,6 @@ from difflcs.rl.rollout import (
     PolicyOutput,
     action_bounds,
     append_context,
-    append_episodes,
     has_context,
     mpc_actions,
     observed_transitions,
@@ -209,7 +208,6 @@ class PDDM(EpisodeTrainer):
         else:
             act = mpc_actions(self.policy, seed=number(self.seed, Stream.PLAN, self.iteration, 0))
         episodes = self.collect(act, count, after_step)
-        self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         if not settings.keep_networks:
             self.ensemble.draw(generator(self.seed, Stream.FIT, self.iteration, 0))

@@ -20,7 +20,7 @@ from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
-from difflcs.rl.rollout import Policy, append_episodes, contexts, mpc_actions, noisy_actions, transitions
+from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
 
@@ -172,7 +172,6 @@ class PhysicsFit(EpisodeTrainer):
         noise = np.random.default_rng((self.seed, Stream.ACTION, self.iteration))
         act = noisy_actions(mpc_actions(self.policy), self.settings.noise, noise)
         episodes = self.collect(act, count, after_step)
-        self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         losses = self._fit()
         self.iteration += 1

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state, untouched
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
-from difflcs.rl.learning.state_tree import State, restore
-from difflcs.rl.rollout import Act, Policy, collect, episodes_from_state, episodes_to_state, make_empty_record
+from difflcs.rl.learning.state_tree import State, Stateful, restore
+from difflcs.rl.rollout import (
+    Act,
+    Policy,
+    append_episodes,
+    collect,
+    episodes_from_state,
+    episodes_to_state,
+    make_empty_record,
+)
 from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
@@ -26,22 +34,6 @@ AfterStep = Callable[[int], object]
 """Called after every step of the environments with the number of episodes that were stepped, for progress bars."""
 
 
-class TrainableModel(Protocol):
-    """An object that a trainer changes and saves: an `LCSModel`, any other module, an ensemble of networks.
-
-    It may also have `config()`, which returns what its class needs besides the tensors to build it again (JSON types
-    only), and `save_pretrained(directory)`, which writes it into a directory, atomically.
-    """
-
-    def state_dict(self) -> Any:
-        """Its tensors by name."""
-        ...
-
-    def load_state_dict(self, state: Mapping[str, Tensor], /) -> Any:
-        """Replace them."""
-        ...
-
-
 class Trainer(ABC):
     """Base of the trainers.
 
@@ -49,13 +41,15 @@ class Trainer(ABC):
     were.
 
     Args:
-        learned: the model to train, in place.
+        learned: what to train, in place: an `LCSModel`, any other module, an ensemble of networks. It may also have
+            `config()`, which returns what its class needs besides the tensors to build it again (JSON types only), and
+            `save_pretrained(directory)`, which writes it into a directory, atomically.
         policy: acts by the model, without noise.
         seed: of everything random.
         episode_steps: steps of one episode.
     """
 
-    def __init__(self, learned: TrainableModel, policy: Policy, seed: int, episode_steps: int):
+    def __init__(self, learned: Stateful, policy: Policy, seed: int, episode_steps: int):
         self.learned, self.policy = learned, policy
         self.seed = check_positive_int("seed", seed, minimum=0)
         self.episode_steps = check_positive_int("episode_steps", episode_steps)
@@ -103,9 +97,7 @@ class EpisodeTrainer(Trainer):
         InvalidInputError: too few environments.
     """
 
-    def __init__(
-        self, learned: TrainableModel, policy: Policy, seed: int, episode_steps: int, env: VectorEnv, episodes: int
-    ):
+    def __init__(self, learned: Stateful, policy: Policy, seed: int, episode_steps: int, env: VectorEnv, episodes: int):
         super().__init__(learned, policy, seed, episode_steps)
         if env.num_envs < episodes:
             raise InvalidInputError(f"env: expected at least {episodes} environments, got {env.num_envs}")
@@ -113,12 +105,13 @@ class EpisodeTrainer(Trainer):
         self.buffer = make_empty_record(env, episode_steps)
         """Episodes to learn from."""
 
-    def collect(self, act: Act, count: int, after_step: AfterStep | None) -> TensorDict:
-        """Collect the next episodes of the training."""
+    def collect(self, act: Act, count: int, after_step: AfterStep | None, kept: int | None = None) -> TensorDict:
+        """Collect the next episodes of the training; the buffer then holds the newest `kept`, all if None."""
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         report = None if after_step is None else lambda: after_step(count)
         episodes = collect(self.env, act, seeds, self.episode_steps, report)
         self.episodes += count
+        self.buffer = append_episodes(self.buffer, episodes, kept)
         return episodes
 
     def state_dict(self) -> dict[str, Any]:
@@ -131,7 +124,7 @@ class EpisodeTrainer(Trainer):
         self.buffer = episodes_from_state(state["episodes"])
 
 
-def learned_state(learned: TrainableModel) -> dict[str, Any]:
+def learned_state(learned: Stateful) -> dict[str, Any]:
     """Return the part of a state that holds the model."""
     state = {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
     if isinstance(learned, LCSModel) and not untouched(learned):
@@ -139,7 +132,7 @@ def learned_state(learned: TrainableModel) -> dict[str, Any]:
     return state
 
 
-def configuration(learned: TrainableModel) -> dict[str, Any]:
+def configuration(learned: Stateful) -> dict[str, Any]:
     """Return the configuration of a model: its `config()`, or the name of its class and its sizes."""
     config: Any = getattr(learned, "config", None)
     if callable(config):
@@ -148,7 +141,7 @@ def configuration(learned: TrainableModel) -> dict[str, Any]:
     return {"class": type(learned).__name__, **sizes}
 
 
-def save_learned(learned: TrainableModel, directory: Path, kind: str | None = None) -> None:
+def save_learned(learned: Stateful, directory: Path, kind: str | None = None) -> None:
     """Write a model into a directory, atomically: by its `save_pretrained`, else as a record of `kind` or its class."""
     save = getattr(learned, "save_pretrained", None)
     if callable(save):

@@ -16,16 +16,7 @@ from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
-from difflcs.rl.rollout import (
-    Policy,
-    action_bounds,
-    append_episodes,
-    contexts,
-    mpc_actions,
-    noisy_actions,
-    transitions,
-    uniform_actions,
-)
+from difflcs.rl.rollout import Policy, action_bounds, contexts, mpc_actions, noisy_actions, transitions, uniform_actions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
 
@@ -239,7 +230,6 @@ class Warmup(EpisodeTrainer):
         start = time.perf_counter()
         episodes = self._collect(after_step)
         collected = time.perf_counter()
-        self.buffer = append_episodes(self.buffer, episodes, self.settings.buffer)
         if isinstance(self.lcs, LCSModel) and self.lcs.action_support is not None:
             self.lcs.action_support.copy_(torch.stack(self.bounds))
         data, context = transitions(self.buffer), contexts(self.buffer)
@@ -275,7 +265,7 @@ class Warmup(EpisodeTrainer):
                 scale = settings.action_support * settings.action_support_growth ** (self.iteration - 1)
                 self.bounds = action_support(self.buffer["action"], scale, self.low, self.high)
             act = noisy_actions(mpc_actions(self.policy, *self.bounds), settings.noise, self._actions)
-        return self.collect(act, count, after_step)
+        return self.collect(act, count, after_step, settings.buffer)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""

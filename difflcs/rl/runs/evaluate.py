@@ -53,10 +53,8 @@ class Evaluation:
     unstable: int
 
     def __str__(self) -> str:
-        return (
-            f"{100 * self.success_rate:.1f} % of {self.goals} goals "
-            f"(95 % interval {100 * self.ci_low:.1f} to {100 * self.ci_high:.1f} %)"
-        )
+        rate, low, high = (100 * value for value in (self.success_rate, self.ci_low, self.ci_high))
+        return f"{rate:.1f} % of {self.goals} goals (95 % interval {low:.1f} to {high:.1f} %)"
 
     def summary(self) -> str:
         """Success and what went wrong, in one line."""

@@ -43,13 +43,11 @@ def plot_learning_curve(rows: Sequence[Mapping[str, str]], path: Path, title: st
         title: above the figure.
     """
     require("matplotlib")
-    from matplotlib import rc_context
     from matplotlib.ticker import NullFormatter
 
-    from difflcs._figure import FONT, PageFigure
+    from difflcs._figure import page_figure
 
-    with rc_context(FONT):
-        figure = PageFigure(6.5)
+    with page_figure() as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         figure.suptitle(title)
 

@@ -120,9 +120,9 @@ class SceneObject(ABC):
     def outline(self) -> np.ndarray:
         """Points [m] around the object as seen from above, relative to its centre of mass, (K, 2)."""
 
-    @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Describe the object in JSON types, for records of results."""
+        """Describe the object in JSON types, for records of results. Subclasses add to it."""
+        return {"name": self.name, "source": self.source, "mass": self.mass, "friction": self.friction}
 
     @abstractmethod
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
@@ -164,14 +164,7 @@ class CubeObject(SceneObject):
 
     def describe(self) -> dict[str, Any]:
         """See `SceneObject`."""
-        return {
-            "name": self.name,
-            "source": self.source,
-            "edge": 2 * self.half_size,
-            "mass": self.mass,
-            "friction": self.friction,
-            "pinned": self.pinned,
-        }
+        return {**super().describe(), "edge": 2 * self.half_size, "pinned": self.pinned}
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
         """See `SceneObject`."""

@@ -57,15 +57,8 @@ class MeshObject(SceneObject):
 
     def describe(self) -> dict[str, Any]:
         """See `SceneObject`."""
-        return {
-            "name": self.name,
-            "source": self.source,
-            "sha256": self.solid.digest,
-            "parts": len(self.solid.parts),
-            "mass": self.mass,
-            "friction": self.friction,
-            "rest_height": round(self.rest_height, 6),
-        }
+        solid = {"sha256": self.solid.digest, "parts": len(self.solid.parts)}
+        return {**super().describe(), **solid, "rest_height": round(self.rest_height, 6)}
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
         """Add the convex parts, which collide, and the mesh, which is seen."""
@@ -143,14 +136,7 @@ class StandInObject(SceneObject):
 
     def describe(self) -> dict[str, Any]:
         """See `SceneObject`."""
-        return {
-            "name": self.name,
-            "source": self.source,
-            "parts": len(self.ycb.stand_in),
-            "mass": self.mass,
-            "friction": self.friction,
-            "rest_height": self.rest_height,
-        }
+        return {**super().describe(), "parts": len(self.ycb.stand_in), "rest_height": self.rest_height}
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
         """See `SceneObject`."""

@@ -5,6 +5,7 @@ The batches come from `tests.conformance.varied`, each element with inputs of it
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -165,10 +166,10 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Case:
     return form.changed(**a)
 
 
-def _solve(form: Case, backend: str, warm: bool) -> Outcome:
+def _solve(form: Case, warm: bool) -> Outcome:
     leaves = leaves_of(form)
     with quiet(), np.errstate(all="ignore"):
-        layer = layer_of(form, leaves, backend)
+        layer = layer_of(form, leaves)
         guess = None
         if warm:
             with torch.no_grad():
@@ -242,13 +243,9 @@ def _cost(case: Case, i: int, x, u) -> tuple[float, float, np.ndarray, np.ndarra
     return total + (price * over).sum(), size + fines, c, terms
 
 
-def form_target(backend: str = "batched", warm: bool = False) -> Callable[[Case, Generator, bool], Outcome]:
+def form_target(form: Case, rng: Generator, gradients: bool, warm: bool = False) -> Outcome:
     """Solve, differentiate and judge."""
-
-    def target(form: Case, rng: Generator, gradients: bool) -> Outcome:
-        return refused_one_by_one(lambda part: _solve(part, backend, warm), form)
-
-    return target
+    return refused_one_by_one(lambda part: _solve(part, warm), form)
 
 
 def untouched(form: Case, rng: Generator, gradients: bool) -> Outcome:
@@ -286,4 +283,4 @@ FORM_CLASSES: dict[str, Callable[..., Case]] = by_name(
     plain, no_contact, zero_rows, opposite_rows, prices, limits, first_stage, not_numbers, extreme, vertex,
     prefix="form-",
 )  # fmt: skip
-FORM_TARGETS = {"batched": form_target(), "warm": form_target(warm=True), "untouched": untouched}
+FORM_TARGETS = {"batched": form_target, "warm": partial(form_target, warm=True), "untouched": untouched}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.random import Generator
@@ -96,17 +97,12 @@ def lcp_plain(rng: Generator, count: int, small: bool = False) -> LCP:
     return LCP(definite(rng, *_batch(rng, count, n)), _q(rng, count, n))
 
 
-def skew(epsilon: float) -> Callable[..., LCP]:
-    def lcp_skew(rng: Generator, count: int, small: bool = False) -> LCP:
-        n = int(rng.integers(2, 13))
-        K = rng.standard_normal(_batch(rng, count, n))
-        q = rng.standard_normal((count, n))
-        return LCP(K - K.swapaxes(-1, -2) + epsilon * np.eye(n), q)
-
-    lcp_skew.__doc__ = (
-        f"F = K − Kᵀ + {epsilon:g}·I: F + Fᵀ is {2 * epsilon:g}·I beside a skew part of size 1; λ up to 1/ε."
-    )
-    return lcp_skew
+def lcp_skew(rng: Generator, count: int, small: bool = False, *, epsilon: float) -> LCP:
+    """F = K − Kᵀ + ε·I: F + Fᵀ is 2ε·I beside a skew part of size 1; λ up to 1/ε."""
+    n = int(rng.integers(2, 13))
+    K = rng.standard_normal(_batch(rng, count, n))
+    q = rng.standard_normal((count, n))
+    return LCP(K - K.swapaxes(-1, -2) + epsilon * np.eye(n), q)
 
 
 def lcp_nearly_singular(rng: Generator, count: int, small: bool = False) -> LCP:
@@ -229,14 +225,11 @@ def mpc_plain(rng: Generator, count: int, small: bool = False) -> Case:
     return _mpc(rng, count, small)
 
 
-def skew_mpc(epsilon: float) -> Callable[..., Case]:
-    def mpc_skew(rng: Generator, count: int, small: bool = False) -> Case:
-        problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
-        K = rng.standard_normal(problem.arrays["F"].shape)
-        return problem.changed(F=K - K.swapaxes(-1, -2) + epsilon * np.eye(K.shape[-1]))
-
-    mpc_skew.__doc__ = f"The plain problem with F = K − Kᵀ + {epsilon:g}·I: forces up to 1/ε times the gaps."
-    return mpc_skew
+def mpc_skew(rng: Generator, count: int, small: bool = False, *, epsilon: float) -> Case:
+    """The plain problem with F = K − Kᵀ + ε·I: forces up to 1/ε times the gaps."""
+    problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
+    K = rng.standard_normal(problem.arrays["F"].shape)
+    return problem.changed(F=K - K.swapaxes(-1, -2) + epsilon * np.eye(K.shape[-1]))
 
 
 def mpc_stiff(rng: Generator, count: int, small: bool = False) -> Case:
@@ -441,13 +434,13 @@ def by_name(*functions: Callable, prefix: str = "") -> dict[str, Callable]:
 
 LCP_CLASSES: dict[str, Callable[..., LCP]] = {
     **by_name(lcp_plain),
-    **{f"lcp-skew-1e-{k}": skew(10.0**-k) for k in (2, 4, 6, 8, 10, 12)},
+    **{f"lcp-skew-1e-{k}": partial(lcp_skew, epsilon=10.0**-k) for k in (2, 4, 6, 8, 10, 12)},
     **by_name(lcp_nearly_singular, lcp_graded, lcp_scaled, lcp_degenerate),
     **by_name(lcp_extreme_q, lcp_p_matrix, lcp_large, lcp_not_definite),
 }
 MPC_CLASSES: dict[str, Callable[..., Case]] = {
     **by_name(mpc_plain),
-    **{f"mpc-skew-1e-{k}": skew_mpc(10.0**-k) for k in (2, 4, 6, 8)},
+    **{f"mpc-skew-1e-{k}": partial(mpc_skew, epsilon=10.0**-k) for k in (2, 4, 6, 8)},
     **by_name(mpc_stiff, mpc_flat, mpc_flat_contact, mpc_flat_tiny, mpc_no_effect, mpc_unstable, mpc_number_bounds),
     **by_name(mpc_touching, mpc_units, mpc_cost_scale, mpc_stuck, mpc_extreme),
 }

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -97,23 +98,21 @@ def _promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
 # ---- solve_lcp ------------------------------------------------------------------------------------------------------
 
 
-def lcp_target(relaxation: float | None, dtype=np.float64) -> Callable[[LCP, Generator, bool], Outcome]:
+def lcp_target(
+    problem: LCP, rng: Generator, gradients: bool, relaxation: float | None = None, dtype=np.float64
+) -> Outcome:
     """`relaxation` None: exact or one of three, drawn."""
-
-    def target(problem: LCP, rng: Generator, gradients: bool) -> Outcome:
-        chosen = float(rng.choice([0.0, 1e-3, 1e-5, 1e-8])) if relaxation is None else relaxation
-        problem = problem.cast(dtype)
-        if not (np.isfinite(problem.F).all() and np.isfinite(problem.q).all()):  # too large for float32
-            problem = LCP(np.nan_to_num(problem.F), np.nan_to_num(problem.q))
-        done = refused_one_by_one(lambda part: _lcp(part, chosen, dtype), problem)
-        if gradients and dtype == np.float64:
-            index = np.flatnonzero(done.solved)[:8]
-            if len(index):
-                ratio, compared = _lcp_differences(problem.select(index).each(), chosen, rng)
-                done.add_gradients(index, ratio, compared)
-        return done
-
-    return target
+    chosen = float(rng.choice([0.0, 1e-3, 1e-5, 1e-8])) if relaxation is None else relaxation
+    problem = problem.cast(dtype)
+    if not (np.isfinite(problem.F).all() and np.isfinite(problem.q).all()):  # too large for float32
+        problem = LCP(np.nan_to_num(problem.F), np.nan_to_num(problem.q))
+    done = refused_one_by_one(lambda part: _lcp(part, chosen, dtype), problem)
+    if gradients and dtype == np.float64:
+        index = np.flatnonzero(done.solved)[:8]
+        if len(index):
+            ratio, compared = _lcp_differences(problem.select(index).each(), chosen, rng)
+            done.add_gradients(index, ratio, compared)
+    return done
 
 
 def _lcp(problem: LCP, relaxation: float, dtype) -> Outcome:
@@ -280,36 +279,33 @@ def interior(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
 
 
 def mpc_target(
-    guess=cold, dtype=np.float64, barrier: float = 0.0, backend="batched", judge=checks.judge_mpc
-) -> Callable[[Case, Generator, bool], Outcome]:
+    problem: Case, rng: Generator, gradients: bool,
+    guess=cold, dtype=np.float64, barrier: float = 0.0, backend="batched", judge=checks.judge_mpc,
+) -> Outcome:  # fmt: skip
     """`barrier` is a part of the cost of the plain problems, which is of size 1."""
-
-    def target(problem: Case, rng: Generator, gradients: bool) -> Outcome:
-        if barrier > 0:
-            open_ = np.broadcast_to(problem.arrays["u_max"] - problem.arrays["u_min"], problem.full()["u_min"].shape)
-            keep = (open_ > 0).all(-1)  # a barrier needs a range
-            if not keep.all():
-                low, high = problem.full()["u_min"], problem.full()["u_max"]
-                high = np.where(high > low, high, low + 1.0)
-                problem = replace(problem, arrays={**problem.arrays, "u_min": low.copy(), "u_max": high})
-            problem = replace(problem, barrier=barrier * float(rng.choice([1.0, 0.1, 10.0])))
-        problem = _castable(problem, dtype)
-        chosen = interior if guess is opposite and rng.random() < 0.3 else guess
-        done = refused_one_by_one(lambda part: _mpc(part, dtype, backend, chosen, judge), problem)
-        if gradients and dtype == np.float64 and backend != "relaxed":
+    if barrier > 0:
+        open_ = np.broadcast_to(problem.arrays["u_max"] - problem.arrays["u_min"], problem.full()["u_min"].shape)
+        keep = (open_ > 0).all(-1)  # a barrier needs a range
+        if not keep.all():
             low, high = problem.full()["u_min"], problem.full()["u_max"]
-            # Gradients are promised for inputs between 1e-30 and 1e30 only.
-            sizes = [np.where(v == 0, 1.0, np.abs(v)).reshape(problem.count, -1) for v in problem.full().values()]
-            sane = np.all([(v.max(1) < 1e30) & (v.max(1) > 1e-30) for v in sizes], axis=0)
-            # float64 itself resolves a range of 1e-12 beside bounds of 1 to four digits.
-            fine = ((high == low) | (high - low > 1e-8 * (np.abs(low) + np.abs(high)))).all(-1)
-            index = np.flatnonzero((done.status == Status.CONVERGED) & fine & sane)[:4]
-            if len(index):
-                ratio, compared = _mpc_differences(problem.select(index).each(), backend, rng)
-                done.add_gradients(index, ratio, compared)
-        return done
-
-    return target
+            high = np.where(high > low, high, low + 1.0)
+            problem = replace(problem, arrays={**problem.arrays, "u_min": low.copy(), "u_max": high})
+        problem = replace(problem, barrier=barrier * float(rng.choice([1.0, 0.1, 10.0])))
+    problem = _castable(problem, dtype)
+    chosen = interior if guess is opposite and rng.random() < 0.3 else guess
+    done = refused_one_by_one(lambda part: _mpc(part, dtype, backend, chosen, judge), problem)
+    if gradients and dtype == np.float64 and backend != "relaxed":
+        low, high = problem.full()["u_min"], problem.full()["u_max"]
+        # Gradients are promised for inputs between 1e-30 and 1e30 only.
+        sizes = [np.where(v == 0, 1.0, np.abs(v)).reshape(problem.count, -1) for v in problem.full().values()]
+        sane = np.all([(v.max(1) < 1e30) & (v.max(1) > 1e-30) for v in sizes], axis=0)
+        # float64 itself resolves a range of 1e-12 beside bounds of 1 to four digits.
+        fine = ((high == low) | (high - low > 1e-8 * (np.abs(low) + np.abs(high)))).all(-1)
+        index = np.flatnonzero((done.status == Status.CONVERGED) & fine & sane)[:4]
+        if len(index):
+            ratio, compared = _mpc_differences(problem.select(index).each(), backend, rng)
+            done.add_gradients(index, ratio, compared)
+    return done
 
 
 def _castable(problem: Case, dtype) -> Case:
@@ -480,21 +476,21 @@ def _loss_differences(problem: Loss, rng: Generator) -> tuple[np.ndarray, int]:
 
 
 LCP_TARGETS = {
-    "exact": lcp_target(0.0),
-    "relaxed 1e-3": lcp_target(1e-3),
-    "relaxed 1e-5": lcp_target(1e-5),
-    "relaxed 1e-8": lcp_target(1e-8),
-    "float32": lcp_target(None, np.float32),
+    "exact": partial(lcp_target, relaxation=0.0),
+    "relaxed 1e-3": partial(lcp_target, relaxation=1e-3),
+    "relaxed 1e-5": partial(lcp_target, relaxation=1e-5),
+    "relaxed 1e-8": partial(lcp_target, relaxation=1e-8),
+    "float32": partial(lcp_target, dtype=np.float32),
 }
 MPC_TARGETS = {
-    "batched": mpc_target(),
-    "warm": mpc_target(shift),
-    "opposite": mpc_target(opposite),
-    "float32": mpc_target(dtype=np.float32),
-    "barrier": mpc_target(barrier=1e-2),
+    "batched": mpc_target,
+    "warm": partial(mpc_target, guess=shift),
+    "opposite": partial(mpc_target, guess=opposite),
+    "float32": partial(mpc_target, dtype=np.float32),
+    "barrier": partial(mpc_target, barrier=1e-2),
 }
 SLOW_TARGETS = {
-    "ipopt": mpc_target(backend=IpoptBackend(workers=1)),
-    "relaxed": mpc_target(backend="relaxed", judge=checks.judge_relaxed_program),
+    "ipopt": partial(mpc_target, backend=IpoptBackend(workers=1)),
+    "relaxed": partial(mpc_target, backend="relaxed", judge=checks.judge_relaxed_program),
 }
 LOSS_TARGETS = {"violation_loss": loss_target}
