@@ -117,6 +117,7 @@ def main(o: Options) -> None:
         o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     torch.set_num_threads(1)
     rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
+    print(f"{len(rows)} evaluations are in {o.out} already; what is missing is added")
     for seed in o.seeds:
         for task in o.tasks:
             for method in o.methods:

@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeGuard, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from difflcs._differentiation import is_wrapped, transforms_active
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
@@ -27,6 +28,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 FLOATS = (torch.float32, torch.float64)
+_REAL = {int, float, np.float32, np.float64, np.int32, np.int64}
 _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 
@@ -52,7 +54,10 @@ def describe_shapes(tensors: Mapping[str, Tensor]) -> str:
 
 
 def to_tensor(value: object) -> object:
-    """Convert a NumPy array of real numbers to a float64 tensor, a copy; anything else stays as it is."""
+    """Convert real numbers in a NumPy array or a list to a float64 tensor, a copy; anything else stays as it is."""
+    if isinstance(value, list) and value and {type(leaf) for leaf in tree_leaves(value)} <= _REAL:
+        with suppress(TypeError, ValueError, OverflowError):  # dictionaries, ragged rows, or an integer too large
+            value = np.array(value, np.float64)
     if not isinstance(value, np.ndarray) or not value.ndim or value.dtype.kind not in "fiu":
         return value
     return torch.from_numpy(np.array(value, np.float64))
@@ -70,7 +75,7 @@ def check_array(name: str, value: object) -> np.ndarray:
 
 
 def takes_arrays(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function of tensors take NumPy arrays, too: see `to_tensor`."""
+    """Make a function of tensors take NumPy arrays and lists of numbers, too: see `to_tensor`."""
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -135,7 +140,7 @@ def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> Non
 
 
 def check_shape(
-    name: str, value: object, shape: str, sizes: Mapping[str, object] | None = None, remedy: str = "reshape it"
+    name: str, value: object, shape: str, sizes: Mapping[str, int | str] | None = None, remedy: str = "reshape it"
 ) -> Tensor:
     """Check one floating-point tensor and its shape, written as in docstrings: "... n_x", "n 2"; "5+" is 5 or more.
 
@@ -143,14 +148,16 @@ def check_shape(
     """
     tensor, batched = check_tensor(name, value), shape.startswith("...")
     words = shape.split()[batched:]
-    dims = [str((sizes or {}).get(word, word)) for word in words]
+    dims = [sizes.get(word, word) for word in words] if sizes else words
     got = tensor.shape[max(tensor.ndim - len(dims), 0) :]
     fits = len(got) == (len(dims) if batched else tensor.ndim) == len(dims)
     for dim, size in zip(dims, got, strict=False):
-        least = size if dim.isidentifier() else int(dim.rstrip("+"))
-        fits = fits and (size >= least if dim.endswith("+") else size == least)
+        if isinstance(dim, str) and dim.endswith("+"):
+            fits = fits and size >= int(dim[:-1])
+        elif isinstance(dim, int) or not dim.isidentifier():
+            fits = fits and size == int(dim)
     if not fits:
-        labels = (dim if dim == word else f"{word}={dim}" for word, dim in zip(words, dims, strict=True))
+        labels = (word if dim == word else f"{word}={dim}" for word, dim in zip(words, dims, strict=True))
         wanted = "..., " * batched + ", ".join(labels) + "," * (len(dims) == 1 and not batched)
         raise ShapeError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}; {remedy}")
     return tensor
@@ -163,17 +170,17 @@ def takes(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        signature = inspect.signature(function)
+        names = tuple(inspect.signature(function).parameters)
+
+        def check(of: object, name: str, value: object) -> Tensor:
+            sizes = {dim: size for dim in shapes[name].split() if (size := getattr(of, dim, None)) is not None}
+            return check_shape(name, value, shapes[name], sizes).to("cpu", torch.float64)
 
         @functools.wraps(function)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-            given = signature.bind(*args, **kwargs)
-            for name in shapes.keys() & given.arguments.keys():
-                sizes = {dim: size for dim in shapes[name].split() if (size := getattr(args[0], dim, None)) is not None}
-                given.arguments[name] = check_shape(name, given.arguments[name], shapes[name], sizes).to(
-                    "cpu", torch.float64
-                )
-            return function(*given.args, **given.kwargs)
+            given = [check(args[0], name, v) if name in shapes else v for name, v in zip(names, args, strict=False)]
+            named = {name: check(args[0], name, v) if name in shapes else v for name, v in kwargs.items()}
+            return function(*given, *args[len(given) :], **named)  # pyright: ignore[reportCallIssue]
 
         return wrapper
 

@@ -77,17 +77,19 @@ def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
     seconds. `torch.autocast` is off inside.
 
     Raises:
-        NotImplementedError: the call is traced by something else, such as `torch.export`.
+        NotImplementedError: the call is traced by something else, such as `torch.export` or `torch.jit.trace`.
     """
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
-            if not torch.compiler.is_dynamo_compiling():
-                raise NotImplementedError(
-                    "expected eager code or torch.compile, got torch.export or the like, whose graph cannot hold a "
-                    "solver; for C there is layer.controller().save(path)"
-                )
+        compiling = torch.compiler.is_compiling()
+        traced = torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
+        if traced or (compiling and not torch.compiler.is_dynamo_compiling()):
+            raise NotImplementedError(
+                "expected eager code or torch.compile, got torch.export, torch.jit.trace or the like, whose graph "
+                "cannot hold a solver; for C there is layer.controller().save(path)"
+            )
+        if compiling:
             return torch.compiler.disable(wrapper)(*args, **kwargs)  # pyright: ignore[reportCallIssue]
         if torch._C._is_any_autocast_enabled():
             with torch._C._DisableAutocast():

@@ -114,6 +114,19 @@ def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed:
     return {**asdict(condition), "reached": "".join(map(str, reached)), "solver_failures": failures}
 
 
+def read(path: Path) -> dict[str, Any]:
+    """Read a record."""
+    try:
+        record: Any = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path}: expected JSON, got {error}; restore it from a copy, or delete it") from error
+    keys = {"options", "machine", "results"}
+    if not isinstance(record, dict) or not keys <= record.keys() or "model" not in record["options"]:
+        wanted = ", ".join(sorted(keys))
+        raise CheckpointError(f"{path}: expected {wanted}, got other JSON; restore it from a copy, or delete it")
+    return record
+
+
 def compute(options: Options, path: Path, say: Callable[[str], object] = print) -> None:
     """Measure what is missing in the record; it is written after every condition."""
     torch.set_num_threads(1)
@@ -127,7 +140,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
         selected = [one for one in selected if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
     new = {"options": asked, "machine": machine(), "results": []}
-    record: Any = json.loads(path.read_text()) if path.exists() else new
+    record = read(path) if path.exists() else new
     if record["options"] != asked:
         raise CheckpointError(
             f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
@@ -193,14 +206,11 @@ def draw_record(options: Options) -> int:
     name = "robustness-smoke" if options.smoke else "robustness"
     options = replace(options, goals=min(options.goals, 4)) if options.smoke else options
     path = options.results / f"{name}.json"
-    try:
-        if options.rerun or options.smoke:
-            compute(options, path)
-        record: Any = json.loads(path.read_text()) if path.exists() else None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{path}: expected JSON, got {error}; restore it from a copy, or delete it") from error
-    if record is None:
+    if options.rerun or options.smoke:
+        compute(options, path)
+    if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
+    record = read(path)
     if record["options"]["model"] != str(options.model):
         raise CheckpointError(
             f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "

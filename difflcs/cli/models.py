@@ -14,6 +14,7 @@ from difflcs._optional import require, versions
 from difflcs._storage import check_place, place_to_write
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.controller_file import constant_cost, constant_system
 from difflcs.mpc.export import CONTROLLER, DESCRIPTION, export_controller
 from difflcs.rl import TrainedPolicy
 from difflcs.rl.runs.evaluate import evaluate
@@ -193,10 +194,12 @@ class Export:
             )
         learned = TrainedPolicy.open(self.model)
         task = get_task(learned.task)
-        if not isinstance(learned.policy, LCSMPCLayer):
+        mpc = learned.policy
+        if not isinstance(mpc, LCSMPCLayer) or None in (constant_system(mpc.lcs), constant_cost(mpc.cost, task.n_x)):
             raise InvalidInputError(
-                f"model: expected one that acts by the MPC, got {learned.name} of method {learned.method}; export a "
-                f"run of another method"
+                f"model: expected one that acts by the MPC with the same system and cost at all states, got "
+                f"{learned.name} of method {learned.method}; export a run of another method, or act from Python by "
+                f"difflcs.rl.TrainedPolicy"
             )
         quantities = {"goal": task.goal, "errors": task.errors}
         about = {
@@ -207,7 +210,7 @@ class Export:
             "object": None if learned.object is None else dict(learned.object),
             **{name: [{"name": q.name, "unit": q.unit} for q in known] for name, known in quantities.items()},
         }
-        path = export_controller(learned.policy, self.out, step_seconds=task.step_seconds, about=about)
+        path = export_controller(mpc, self.out, step_seconds=task.step_seconds, about=about)
         if not learned.finished:
             print(f"{learned.name} is not finished: exported its latest checkpoint")
         print(f"written: {path}\nits numbers: {self.out / DESCRIPTION}")

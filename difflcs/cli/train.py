@@ -18,7 +18,7 @@ from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.figures import NoPictureError, plot_learning_curve
 from difflcs.rl.runs.progress import Progress
 from difflcs.rl.runs.training import TrainConfig, stored_config, sum_seconds, train
-from difflcs.rl.tasks import get_task, task_names
+from difflcs.rl.tasks import get_task, is_installed, task_names
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Train(TrainConfig):
             run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in sum_seconds(run.rows()).items() if seconds)
         print(f"time: {spent}")
-        print(f"finished: {run.path}\nevaluate it with: {self.program} evaluate {shlex.quote(str(run.path))}")
+        print(f"finished: {run.path}\nevaluate it with: {self.program(config)} evaluate {shlex.quote(str(run.path))}")
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
@@ -71,13 +71,15 @@ class Train(TrainConfig):
     def interrupted(self) -> str:
         """Return the advice after Ctrl-C."""
         out = self.directory(self.out)
-        begun, name = (out / "config.json").is_file(), shlex.quote(str(out))
-        return f"continue with: {self.program} train --out {name} --resume" if begun else "nothing was changed"
+        if not (out / "config.json").is_file():
+            return "nothing was changed"
+        program = self.program(stored_config(RunDirectory.open(out)))
+        return f"continue with: {program} train --out {shlex.quote(str(out))} --resume"
 
-    @property
-    def program(self) -> str:
-        """The command line that knows the method: that of the script which has registered it, or our own."""
-        own = type(self.method).__module__.startswith("difflcs.")
+    @staticmethod
+    def program(config: TrainConfig) -> str:
+        """Return the command line that knows method and task: that of the script with one of them, or our own."""
+        own = type(config.method).__module__.startswith("difflcs.") and is_installed(config.task)
         return "difflcs" if own else f"python {sys.argv[0]}"
 
 

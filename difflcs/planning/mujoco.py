@@ -25,6 +25,12 @@ _COAST = 2.0  # steps in which a robot that is no longer driven comes to rest, a
 _POINTS = 8  # of a straight way, at which gaps are asked for
 
 
+class _Effectors(MujocoCost):
+    """Positions of end effectors, which errors call by the argument of `BodyPlaces`."""
+
+    _called = "effectors[{}]"
+
+
 class BodyPlaces:
     """End effectors of a MuJoCo model round a body of any shape, on slides or at the end of arms.
 
@@ -57,11 +63,7 @@ class BodyPlaces:
         height: float | None = None,
     ):
         names = check_list("effectors", effectors, "name bodies, sites or geoms")
-        try:
-            self._cost = MujocoCost(module, [Position(name) for name in names])
-        except InvalidInputError as error:
-            text = str(error).replace("terms[", "effectors[").replace("] Position", "]")
-            raise type(error)(text) from None
+        self._cost = _Effectors(module, [Position(name) for name in names])
         self.module, self.n_places = module, check_positive_int("n_places", n_places)
         self.n_x, self.n_effectors, self.n_place = module.n_x, len(names), 3 * len(names)
         self.gap = 0.1 * module.length if gap is None else check_number("gap", gap, strict=True)

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_number, check_positive_int, did_you_mean, make_plain
+from difflcs._checks import check_kind, check_number, check_positive_int, check_tensor, did_you_mean, make_plain
 from difflcs._optional import require
 from difflcs.cost import CostModule, GoalCost
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
 from difflcs.records import LCSModule
@@ -45,6 +45,19 @@ def compute_features(
     """Compute the features of states, and of their contexts if there are any."""
     seen = (state, goal, elapsed)
     return features(*seen) if context is None else features(*seen, context)
+
+
+def count_features(features: Features, *sizes: Sequence[int]) -> int:
+    """Count what features return, for a state, a goal, an elapsed fraction and perhaps a context of these sizes.
+
+    Raises:
+        DTypeError, ShapeError: they return no tensor (..., n).
+    """
+    of_two = features(*(torch.zeros(2, *size, dtype=torch.float64) for size in sizes))
+    found = check_tensor("features", of_two, finite=False)
+    if found.shape[:-1] != (2,):
+        raise ShapeError(f"features: expected (2, n) of two states, got {tuple(found.shape)}; return (..., n)")
+    return found.shape[-1]
 
 
 class Outcome(Protocol):
@@ -244,8 +257,8 @@ class TaskSpec:
     @functools.cached_property
     def n_features(self) -> int:
         """Number of features."""
-        sizes = [(self.n_x,), (self.n_goal,), (), *([(self.n_context,)] if self.n_context else [])]
-        return len(self.features(*(torch.zeros(size, dtype=torch.float64) for size in sizes)))
+        sizes = (self.n_x,), (self.n_goal,), (), (self.n_context,)
+        return count_features(self.features, *sizes[: 3 + (self.n_context > 0)])
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -294,14 +307,21 @@ class TaskSpec:
                     arguments["threads"] = threads
                 envs = gymnasium.make_vec(self.env, num_envs=count, **arguments)
         try:
-            self._check_actions(envs.single_action_space)
+            self._check_spaces(envs.single_observation_space, envs.single_action_space)
         except InvalidInputError:
             envs.close()
             raise
         return envs
 
-    def _check_actions(self, space: Any) -> None:
-        """Raise if the bounds are wider than those of the environment, which would clip the planned actions."""
+    def _check_spaces(self, seen: Any, space: Any) -> None:
+        """Raise if spaces of the environment have other sizes than the cost, or it would clip the planned actions."""
+        shapes = {name: one.shape for name, one in getattr(seen, "spaces", {}).items()}
+        for name, size in (("state", self.n_x), ("goal", self.n_goal)):
+            if shapes.get(name) != (size,):
+                raise InvalidInputError(
+                    f"task {self.name}: expected an environment whose observations are a Dict with a {name} of shape "
+                    f"({size},), as the cost has {name}s of that size, got {seen}; change one of them"
+                )
         if getattr(space, "shape", None) != (self.n_u,) or not hasattr(space, "low"):
             raise InvalidInputError(
                 f"task {self.name}: expected an environment whose action space is a Box of shape ({self.n_u},), as the "
@@ -368,6 +388,8 @@ def single_start_backend(name: str) -> Backend:
 # --- registry ---------------------------------------------------------------------------------------------------------
 
 _REGISTRY: dict[str, TaskSpec] = {}
+_INSTALLED: set[str] = set()
+"""Names of those of installed packages, which every program knows."""
 _FAILED: dict[str, str] = {}
 """Entry points that could not be loaded → why."""
 
@@ -391,6 +413,7 @@ def _load_entry_points() -> None:
             entry.load()()
         except Exception as error:  # a broken package of others must not take the rest with it
             _FAILED[f"{entry.name} = {entry.value}"] = f"{type(error).__name__}: {error}"
+    _INSTALLED.update(name for name, spec in _REGISTRY.items() if registered.get(name) is not spec)
     _REGISTRY.update(registered)
 
 
@@ -398,6 +421,12 @@ def task_names() -> tuple[str, ...]:
     """Names of all tasks, those of installed packages first."""
     _load_entry_points()
     return tuple(_REGISTRY)
+
+
+def is_installed(task: str) -> bool:
+    """Tell whether a task is one of an installed package, or one that this program alone has registered."""
+    _load_entry_points()
+    return task in _INSTALLED
 
 
 def get_task(task: str | TaskSpec) -> TaskSpec:

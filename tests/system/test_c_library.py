@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,9 @@ from difflcs.errors import InvalidInputError
 from difflcs.mpc import MPCController
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.export import export_controller
+from difflcs.physics import BodyFrameLCS
+from difflcs.rl import TrainedPolicy
+from difflcs.rl.tasks import get_task, single_start_backend
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("cmake", "cc", "c++")
@@ -192,8 +196,6 @@ def test_what_export_writes(exported, capsys):
 
 
 def test_the_exported_controller_is_that_of_the_model(exported):
-    from difflcs.rl.tasks import get_task, single_start_backend
-
     mpc = get_task("cube").make_policy(LCSModel.from_pretrained(MODEL), single_start_backend("batched"))
     one, two = mpc.controller(), MPCController.load(exported / "controller.difflcs")
     for x in 0.02 * np.random.default_rng(0).normal(size=(5, 9)):
@@ -206,6 +208,14 @@ def test_a_controller_stays_within_the_action_support_of_its_model(tmp_path):
     low, high = LCSModel.from_pretrained("trifinger-cube").action_support.tolist()  # within the ±15 mm of the task
     assert (described["u_min"], described["u_max"]) == (low, high)
     assert max(map(abs, low + high)) <= 0.015
+
+
+def test_a_run_whose_system_depends_on_the_state_is_not_exported(tmp_path, monkeypatch, capsys):
+    policy = get_task("cube").make_policy(BodyFrameLCS(9, 6, 3))
+    learned = SimpleNamespace(task="cube", policy=policy, name="mine", method="frame-lcs")
+    monkeypatch.setattr(TrainedPolicy, "open", lambda _: learned)
+    assert cli.main(["export", "runs/mine", "--out", str(tmp_path / "out")]) == 2
+    assert "got mine of method frame-lcs; export a run of another method, or act from Python" in capsys.readouterr().err
 
 
 def test_layers_are_exported_too(build, tmp_path):

@@ -243,7 +243,8 @@ def test_what_a_training_shows_without_a_terminal(capsys, tmp_path):
     ]
     assert f"evaluate it with: difflcs evaluate '{tmp_path / 'my run'}'" in out
     registered = type("Mine", (ViolationMethod,), {"__module__": "__main__"})()
-    assert cli_train.Train(method=registered).program == f"python {sys.argv[0]}"
+    for mine in (cli_train.Train(method=registered), cli_train.Train(task="registered")):
+        assert mine.program(mine) == f"python {sys.argv[0]}"
     assert logging.getLogger("difflcs").handlers == [difflcs_handler()]
 
 

@@ -574,9 +574,10 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     (tmp_path / "robustness.json").write_text(json.dumps(record))
     with pytest.raises(CheckpointError, match="expected a record of runs/mine, got one of zoo:trifinger-cube"):
         robustness.draw_record(replace(options, smoke=False, model=Path("runs/mine")))
-    (tmp_path / "robustness.json").write_text(json.dumps(record)[:-9])
-    with pytest.raises(CheckpointError, match=r"robustness\.json: expected JSON"):
-        robustness.draw_record(replace(options, smoke=False))
+    for text, message in ((json.dumps(record)[:-9], "expected JSON"), ("[]", "expected machine, options")):
+        (tmp_path / "robustness.json").write_text(text)
+        with pytest.raises(CheckpointError, match=rf"robustness\.json: {message}"):
+            robustness.draw_record(replace(options, smoke=False))
     (tmp_path / "robustness.json").unlink()
     with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
         robustness.draw_record(replace(options, smoke=False))

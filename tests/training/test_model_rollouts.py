@@ -12,6 +12,7 @@ from difflcs.errors import DiffLCSWarning, InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
+from tests.conftest import refuse
 
 STEPS, N_X, N_U = 5, 2, 2
 SPACES = SimpleNamespace(
@@ -167,3 +168,6 @@ def test_unstable_episodes_are_not_learned_from_and_another_outcome_is_told():
     for name, other in ("reward", real["reward"] + 1), ("success", ~yes):
         with pytest.warns(DiffLCSWarning, match="another task"):
             models.add(TensorDict({**real, name: other}, [6]))
+    for wrong in (None, real["reward"], (real["reward"], yes)):
+        models = ModelRollouts(SPACES, lambda *_, wrong=wrong: wrong, small(), 0, STEPS)
+        refuse(InvalidInputError, r"outcome: expected rewards and successes .*got .*; mend", models.add, real)

@@ -42,7 +42,8 @@ BAD_TENSORS = {
     "half": (lambda t: t.half(), e.DTypeError, "expected float32 or float64, got .*float16"),
     "bool": (lambda t: torch.zeros(t.shape, dtype=torch.bool), e.DTypeError, "got .*bool"),
     "complex": (lambda t: t.to(torch.complex128), e.DTypeError, "got .*complex128"),
-    "list": (lambda t: t.tolist(), e.DTypeError, "(?s)expected a torch.Tensor, got list.*torch.as_tensor"),
+    "list": (lambda t: [*map(str, t.flatten().tolist())], e.DTypeError,
+     "(?s)expected a torch.Tensor, got list.*torch.as_tensor"),
     "words": (lambda t: t.numpy().astype(str), e.DTypeError, r"expected a torch.Tensor, got ndarray \(.*\) <U.*wrap"),
     "none": (lambda t: None, (e.DTypeError, e.ShapeError), "expected .*(got|none)"),
     "meta": (lambda t: t.to("meta"), e.DeviceError, r"got .* on meta; move it with .*\.to\('cpu'\)"),
@@ -124,7 +125,7 @@ def test_a_bad_tensor_is_refused_by_its_name(build, function, name, bad):
 
 
 @pytest.mark.parametrize("function", sorted(ENTRIES.keys() - {"guess"}))
-def test_an_array_is_taken_like_a_tensor(build, function):
+def test_an_array_or_a_list_is_taken_like_a_tensor(build, function):
     call, tensors = entry(build, function, build.model())
 
     def numbers(**tensors):
@@ -134,7 +135,8 @@ def test_an_array_is_taken_like_a_tensor(build, function):
         return [v for v in tree_leaves(made) if isinstance(v, torch.Tensor)]
 
     arrays = {name: value.numpy()[..., ::-1][..., ::-1] for name, value in tensors.items()}  # torch has no such strides
-    assert all(map(torch.equal, numbers(**arrays), numbers(**tensors)))
+    for given in (arrays, {name: value.tolist() for name, value in tensors.items()}):
+        assert all(map(torch.equal, numbers(**given), numbers(**tensors)))
 
 
 @pytest.mark.parametrize("name", ["A", "D", "G", "c"])

@@ -52,7 +52,7 @@ BAD_ROWS = [
     ({"G": full(INF, 3, 4)}, NonFiniteError, "G: expected finite numbers, got 12"),
     ({"E": full(INF, 3, 2)}, NonFiniteError, "E: expected finite numbers, got 6"),
     ({"g": full(NAN, 3)}, NonFiniteError, "g: expected numbers or infinity, got 3 NaN"),
-    ({"g": [1.0, 1.0, 1.0]}, DTypeError, "g: expected a torch.Tensor, got list"),
+    ({"g": [1.0, [1.0], True]}, DTypeError, "g: expected a torch.Tensor, got list"),
     ({"G": torch.ones(3, 4, dtype=torch.int64)}, DTypeError, "G: expected float32 or float64"),
     ({"G": None}, DTypeError, "G: expected a torch.Tensor, got NoneType"),
 ]

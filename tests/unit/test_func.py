@@ -1,6 +1,7 @@
 """The layer under torch.func: the numbers of plain calls, or an error. Jacobians and torch.compile: test_transforms."""
 
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -151,9 +152,11 @@ def test_forward_mode_is_refused_whatever_requires_a_gradient(layer, x0, learnab
         jvp(lambda x: mpc(x).u, (x0,), (x0,))
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_a_graph_that_cannot_hold_a_solver_is_refused(layer, x0):
-    with pytest.raises(NotImplementedError, match=r"got torch\.export or the like"):
-        torch.export.export(layer, (x0,), strict=False)
+    for trace in (partial(torch.export.export, strict=False), torch.jit.trace):
+        with pytest.raises(NotImplementedError, match=r"got torch\.export, torch\.jit\.trace or the like"):
+            trace(layer, (x0,))
 
 
 def test_what_was_made_in_inference_mode_serves_where_gradients_are_recorded(layer, x0):

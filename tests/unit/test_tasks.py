@@ -144,6 +144,19 @@ def test_bad_values_are_refused(change, error, message):
     refuse(error, message, make_task, **change)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features": lambda state, *_: state[..., 0]}, r"features: expected \(2, n\) of .*got \(2,\); return"),
+        ({"make_cost": lambda: GoalCost.reach(3, 1, goal_weight=(1.0,))}, r"with a state of shape \(3,\), as the cost"),
+        ({"make_cost": lambda: GoalCost.reach(2, 1)}, r"with a goal of shape \(2,\), as the cost"),
+    ],
+)
+def test_what_does_not_fit_its_environment_or_a_network_is_refused_with_it(change, message):
+    task = make_task(**{**change, "goal": (), "example_goals": ()})
+    refuse(InvalidInputError, message, lambda: task.make_envs(1).close() or task.n_features)
+
+
 def test_a_registered_task_is_found_and_replaced_by_its_name():
     assert get_task(TOY) is TOY  # registered or not
     mine = make_task("unit-toy")

@@ -157,6 +157,7 @@ class MujocoCost(TensorFields):
     """
 
     local = True
+    _called = "terms[{}] {}"  # what errors call a term by its number and kind
 
     def __init__(self, module: MujocoLCS, terms: Sequence[Term]):
         super().__init__()
@@ -165,7 +166,7 @@ class MujocoCost(TensorFields):
             raise DTypeError(f"terms: expected a list of Position, Orientation, …, got {describe(terms)}; give some")
         self.n_x, self.n_u = module.n_x, module.n_u
         self._scene = _Scene(module)
-        rows = [self._scene.bind(f"terms[{k}] {type(term).__name__}", term) for k, term in enumerate(terms)]
+        rows = [self._scene.bind(self._called.format(k, type(term).__name__), term) for k, term in enumerate(terms)]
         ends = np.cumsum([0, *(row.size for row in rows)])
         weights = np.zeros((2, ends[-1]))  # of stages and of the final state
         self._learned: list[tuple[str, Any]] = []

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from difflcs._checks import check_positive_int
+from difflcs._checks import check_positive_int, describe
 from difflcs.errors import DiffLCSWarning, InvalidInputError, warn
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.state_tree import State
@@ -147,7 +147,7 @@ class ModelEnv(VectorEnv):
         u = torch.from_numpy(np.asarray(actions, np.float64))
         after = self._predict(self._state, u, self._networks[self._step], self._context)
         ended = np.full(self.num_envs, self._step + 1 == self.episode_steps)
-        reward, success = self.outcome(self._state, u, after, self._goal, torch.from_numpy(ended))
+        reward, success = self.judge(self._state, u, after, self._goal, torch.from_numpy(ended))
         self._state, self._step = after, self._step + 1
         return self._observe(), reward.numpy(), nothing, ended, {"success": success.numpy()}
 
@@ -170,8 +170,20 @@ class ModelEnv(VectorEnv):
         actions, networks = actions.flatten(0, 2), self._networks.T.unsqueeze(2).expand(shape).flatten()
         ended = (torch.arange(1, shape[1] + 1) == self.episode_steps).view(1, -1, 1).expand(shape).flatten()
         after = self._predict(before, actions, networks, context)
-        reward, success = self.outcome(before, actions, after, goals, ended)
+        reward, success = self.judge(before, actions, after, goals, ended)
         return after.view(*shape, -1), reward.view(shape), success.view(shape)
+
+    def judge(self, *transitions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rewards (B,) and successes (B,) of transitions, by the outcome of the task.
+
+        Raises:
+            InvalidInputError: it gives something else.
+        """
+        found: Any = self.outcome(*transitions)  # pyright: ignore[reportCallIssue]
+        if not isinstance(found, tuple) or [getattr(v, "shape", None) for v in found] != [transitions[0].shape[:1]] * 2:
+            n, got = len(transitions[0]), describe(found)
+            raise InvalidInputError(f"outcome: expected rewards and successes ({n},), got {got}; mend TaskSpec.outcome")
+        return found
 
     def _predict(self, states: Tensor, actions: Tensor, networks: Tensor, context: Tensor | None) -> Tensor:
         """States (B, n_x), actions (B, n_u), numbers of networks (B,), contexts → next states (B, n_x) in range."""
@@ -230,7 +242,7 @@ class ModelRollouts:
         steps = real["reward"].shape[1]
         ended = torch.arange(1, steps + 1).repeat(len(real)) == steps
         goals = real["goal"].repeat_interleave(steps, 0)
-        reward, success = self.env.outcome(*transitions(real), goals, ended)
+        reward, success = self.env.judge(*transitions(real), goals, ended)
         off = (reward - real["reward"].flatten()).abs() > 1e-3 * real["reward"].abs().max()
         off[ended] |= success[ended] != real["success"]
         if (share := float(off.double().mean())) > 0.01:

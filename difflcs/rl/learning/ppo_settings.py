@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-import torch
-
 from difflcs.errors import InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
@@ -22,7 +20,7 @@ from difflcs.rl.learning.surrogate import OUTLIER_KL, Surrogate
 from difflcs.rl.rollout import CONTEXT, action_bounds, has_context
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Adam, Settings, ViolationLoss, bounded, group
-from difflcs.rl.tasks import Features
+from difflcs.rl.tasks import Features, count_features
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -139,9 +137,9 @@ def make_ppo(
     sizes = [space["state"].shape, space["goal"].shape, ()]
     if has_context(env):
         sizes.append(space[CONTEXT].shape)
-    example = features(*(torch.zeros(size, dtype=torch.float64) for size in sizes))
+    n_inputs = count_features(features, *sizes)
     key = (seed, Stream.VALUE, first_iteration)
-    critic = Critic(settings.critic, len(example), episode_steps, settings.gamma, settings.zeta, key)
+    critic = Critic(settings.critic, n_inputs, episode_steps, settings.gamma, settings.zeta, key)
     scale = RewardScale(settings.cost_limit, failure_penalty, settings.reward_scale)
     judge = GAEAdvantages(critic)
     practice = None
@@ -160,7 +158,7 @@ def make_ppo(
     if settings.gain is not None:
         best, actor = actor, copy.deepcopy(actor)
         failure = settings.reward_scale * failure_penalty
-        incumbent = Incumbent(best, actor, failure, settings.gain, len(example))
+        incumbent = Incumbent(best, actor, failure, settings.gain, n_inputs)
     betas = settings.adam.betas
     deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
     return PPO(
