@@ -558,11 +558,12 @@ void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const Mpc
   }
 }
 
-// Sets the first actions of a job to those of a plan, varied.
-void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
+// Sets the first actions of a job to those of a plan, varied. `again`: the plan has been shifted in vain.
+void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan,
+                     int64_t job) {
   const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
   const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
-  const bool shifted = kind / kVaried % kRounds == 0;
+  const bool shifted = kind / kVaried % kRounds == 0 && !again;
   const bool melted = !shifted && kind % 2 == 1;
   const bool stretched = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
   const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
@@ -611,7 +612,8 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].explore = kExploreFar;
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
-      vary(batch, effort, few && v == varied - 1 ? kSoftest : kVaried * round + v, out.u + e * n.u, j);
+      const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
+      vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {

@@ -78,7 +78,7 @@ class MpcSearch {
   void harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
               int64_t count);
   bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
-  void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job);
+  void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan, int64_t job);
   void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
                int64_t count);
   void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
