@@ -285,7 +285,7 @@ FITS_NOT_A_LAYER = [
     (lambda b: {"bounds": (-1, 1)}, DTypeError, r"bounds: expected StageBounds, got tuple \(-1, 1\); pass constant"),
     (lambda b: {"bounds": StageBounds(-ones(3, 2), 1.0), "u_min": 0.0}, ShapeError,
      "u_min: expected none with bounds, got float 0.0; put it"),
-    (lambda b: {"constraints": [1]}, DTypeError,
+    (lambda b: {"constraints": [LinearConstraints(ones(2, 4), ones(2))]}, DTypeError,
      "constraints: expected LinearConstraints or ConstraintSequence, got list"),
     (lambda b: {"constraints": LinearConstraints(ones(2, 5), ones(2))}, ShapeError,
      "constraints: expected n_x=4 like the LCS, got n_x=5"),

@@ -111,7 +111,7 @@ def test_transitions_that_cannot_be_used_are_refused(data, name):
             suggest_scales(**{**good, name: value})
 
     refuse(DTypeError, f"{name}: expected float32 or float64, got .*int64.*; convert", good[name].long())
-    refuse(DTypeError, rf"{name}: expected a torch.Tensor, got list.*; wrap", good[name][:2].tolist())
+    refuse(DTypeError, rf"{name}: expected a torch.Tensor, got list.*; wrap", [*map(str, good[name][:, 0].tolist())])
     refuse(DeviceError, f"{name}: expected a tensor with data.*; move", good[name].to("meta"))
     bad = good[name].clone()
     bad[3, 1] = torch.nan
