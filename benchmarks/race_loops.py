@@ -308,10 +308,7 @@ def rivals(task: str) -> dict[str, tuple[str, Draw]]:
     found = {label: row for label, row in draws().items() if row[0] != "sampling" and label not in out}
     found[f"sampling on the LCS, {lcs} rollouts"] = ("sampling", partial(draw, rollouts=lcs))
     if simulated:
-        found[f"sampling in MuJoCo, {simulated} rollouts"] = (
-            "simulated",
-            partial(draw, rollouts=simulated),
-        )
+        found[f"sampling in MuJoCo, {simulated} rollouts"] = ("simulated", partial(draw, rollouts=simulated))
     return found
 
 
