@@ -9,22 +9,11 @@
 
 #include <atomic>
 #include <cmath>
-#include <condition_variable>
 #include <cstdint>
-#include <deque>
-#include <functional>
-#include <memory>
-#include <mutex>
 #include <stdexcept>
+#include <system_error>
 #include <thread>
 #include <vector>
-
-#if defined(_WIN32)
-#include <process.h>
-#define getpid _getpid
-#else
-#include <unistd.h>
-#endif
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -41,84 +30,21 @@ using GetStateFunction = void (*)(const void* model, const void* data, double* s
 
 // --- threads --------------------------------------------------------------------------------------
 
-// Threads that wait for work, started when first needed and never stopped.
-class Pool {
- public:
-  // Call work(0), ..., work(count - 1) on up to `threads` threads, this one included.
-  static void run(int count, int threads, const std::function<void(int)>& work) {
-    if (threads > count) threads = count;
-    if (threads <= 1) {
-      for (int i = 0; i < count; ++i) work(i);
-      return;
-    }
-    auto job = std::make_shared<Job>(count, work);
-    instance().post(job, threads - 1);
-    job->take_part();
-    std::unique_lock<std::mutex> lock(job->mutex);
-    job->finished.wait(lock, [&] { return job->done == job->count; });
-  }
-
- private:
-  struct Job {
-    Job(int count, const std::function<void(int)>& work) : count(count), work(work) {}
-
-    void take_part() {
-      int mine = 0;
-      for (int i; (i = next.fetch_add(1)) < count; ++mine) work(i);
-      if (mine == 0) return;
-      std::lock_guard<std::mutex> lock(mutex);
-      done += mine;
-      if (done == count) finished.notify_all();
-    }
-
-    const int count;
-    const std::function<void(int)>& work;  // outlives the job: run() waits; a late thread finds nothing to take
-    std::atomic<int> next{0};
-    int done = 0;
-    std::mutex mutex;
-    std::condition_variable finished;
+// Calls work(0), ..., work(count - 1) on up to `threads` threads, this one included.
+template <class Work>
+void on_threads(int count, int threads, Work work) {
+  std::atomic<int> next{0};
+  auto take = [&] {
+    for (int i; (i = next.fetch_add(1)) < count;) work(i);
   };
-
-  // A forked process has the memory of the pool but not its threads: it starts its own.
-  static Pool& instance() {
-    static std::mutex guard;
-    static Pool* pool = nullptr;
-    static int owner = -1;
-    std::lock_guard<std::mutex> lock(guard);
-    if (const int self = static_cast<int>(getpid()); owner != self) {
-      pool = new Pool;
-      owner = self;
-    }
-    return *pool;
+  std::vector<std::thread> helpers;
+  try {
+    for (int t = 1; t < threads && t < count; ++t) helpers.emplace_back(take);
+  } catch (const std::system_error&) {  // the work is shared by those that run
   }
-
-  void post(const std::shared_ptr<Job>& job, int helpers) {
-    {
-      std::lock_guard<std::mutex> lock(mutex_);
-      for (; workers_ < helpers; ++workers_) std::thread([this] { serve(); }).detach();
-      for (int i = 0; i < helpers; ++i) queue_.push_back(job);
-    }
-    ready_.notify_all();
-  }
-
-  void serve() {
-    for (;;) {
-      std::shared_ptr<Job> job;
-      {
-        std::unique_lock<std::mutex> lock(mutex_);
-        ready_.wait(lock, [&] { return !queue_.empty(); });
-        job = std::move(queue_.front());
-        queue_.pop_front();
-      }
-      job->take_part();
-    }
-  }
-
-  std::mutex mutex_;
-  std::condition_variable ready_;
-  std::deque<std::shared_ptr<Job>> queue_;
-  int workers_ = 0;
-};
+  take();
+  for (std::thread& helper : helpers) helper.join();
+}
 
 // --- one simulation -------------------------------------------------------------------------------
 
@@ -320,8 +246,8 @@ void step_lanes(const std::vector<const Lane*>& lanes, Actions actions, States s
   double* x = states.data();
   bool* ok = stable.data();
   nb::gil_scoped_release release;
-  Pool::run(static_cast<int>(n), threads,
-            [&](int i) { ok[i] = lanes[i]->step(u + kActionSize * i, x + kStateSize * i); });
+  on_threads(static_cast<int>(n), threads,
+             [&](int i) { ok[i] = lanes[i]->step(u + kActionSize * i, x + kStateSize * i); });
 }
 
 }  // namespace
