@@ -155,8 +155,8 @@ def solve(solver: Solver, *tensors: Tensor) -> tuple[Tensor, ...]:
     return solver.solve(tensors, transformed=False)
 
 
-def _keep(ctx: Any, solver: Solver, tensors: Tensors, outputs: Tensors, kept: Iterable[Tensor]):
-    ctx.solver, ctx.count = solver, len(tensors)
+def _keep(ctx: Any, solver: Solver, tensors: Tensors, outputs: Tensors, kept: Iterable[Tensor], recorded: bool):
+    ctx.solver, ctx.count, ctx.recorded = solver, len(tensors), recorded
     ctx.save_for_backward(*tensors, *kept)  # also so that autograd refuses inputs that were changed in place
     ctx.mark_non_differentiable(*outputs[solver.differentiable :])
     ctx.set_materialize_grads(False)
@@ -167,7 +167,7 @@ class _Eager(torch.autograd.Function):
     @staticmethod
     def forward(ctx, solver: Solver, *tensors: Tensor):
         outputs = solver.solve(tensors, transformed=False)
-        _keep(ctx, solver, tensors, outputs, () if solver.keeps else outputs)
+        _keep(ctx, solver, tensors, outputs, () if solver.keeps else outputs, recorded=False)
         return outputs
 
     @staticmethod
@@ -175,7 +175,8 @@ class _Eager(torch.autograd.Function):
         solver, saved, grads = ctx.solver, ctx.saved_tensors, grads[: ctx.solver.differentiable]
         if all(grad is None for grad in grads):
             return (None,) * (1 + ctx.count)
-        gradients = pull_back(solver, saved[: ctx.count], saved[ctx.count :], grads, ctx.needs_input_grad[1:])
+        needs, recorded = ctx.needs_input_grad[1:], ctx.recorded
+        gradients = pull_back(solver, saved[: ctx.count], saved[ctx.count :], grads, needs, recorded)
         return None, *gradients
 
 
@@ -189,7 +190,8 @@ class _Transformed(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        _keep(ctx, inputs[0], inputs[1:], output, output[-1:] if inputs[0].keeps else output[:-1])
+        kept = output[-1:] if inputs[0].keeps else output[:-1]
+        _keep(ctx, inputs[0], inputs[1:], output, kept, recorded=True)
 
     backward = _Eager.backward
 
@@ -205,14 +207,20 @@ class _Transformed(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-def pull_back(solver: Solver, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
-    """Run a solver's pullback in the backward pass of an autograd function, under any transform."""
+def pull_back(
+    solver: Solver, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool], recorded: bool
+) -> Gradients:
+    """Run a solver's pullback in the backward pass of an autograd function, under any transform.
+
+    `recorded`: the solve was inside a transform. The function that `torch.func.vjp` returns is called outside.
+    """
     legacy = torch._C._functorch.is_legacy_batchedtensor  # pyright: ignore[reportAttributeAccessIssue]
     batched = any([grad is not None and legacy(grad) for grad in grads])
-    if torch.is_grad_enabled() and (batched or not transforms_active()):
+    recorded = recorded or transforms_active()
+    if torch.is_grad_enabled() and (batched or not recorded):
         solver.refuse()
-    if batched or transforms_active():
-        # Inside a transform of torch.func every backward pass is recorded; it is refused when it is differentiated.
+    if batched or recorded:
+        # Transforms of torch.func record every backward pass; it is refused when it is differentiated.
         function = _pull_back_legacy if batched else _Pullback.apply
         results = iter(function(solver, needs, len(tensors), len(outputs), *tensors, *outputs, *grads))  # pyright: ignore
         gradients = [next(results) if needed else None for needed in needs]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from torch.autograd.functional import jacobian
-from torch.func import functional_call, grad, jacrev, vmap
+from torch.func import functional_call, grad, jacrev, vjp, vmap
 
 from difflcs import LCSMPCLayer, LCSParams, LCSSequence, MPCSolution, Status, prediction_loss, solve_lcp, violation_loss
 from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
@@ -85,6 +85,7 @@ REFUSED = {
     "Hessian": lambda f, z: torch.autograd.functional.hessian(lambda z: f(z).square().sum(), z),
     "vectorised, recorded": lambda f, z: jacobian(f, z.requires_grad_(), vectorize=True, create_graph=True),
     "backward through grad": lambda f, z: grad(lambda z: f(z).square().sum())(z.requires_grad_()).sum().backward(),
+    "backward through vjp": lambda f, z: vjp(f, z.requires_grad_())[1](f(z).detach())[0].sum().backward(),
     "create_graph": lambda f, z: torch.autograd.grad(f(z.requires_grad_()).sum(), z, create_graph=True),
 }
 
@@ -112,7 +113,10 @@ def test_every_way_to_a_jacobian_gives_the_same(function):
     of, at = function
     expected = jacobian(of, at)
     assert float(expected.abs().max()) > 0.1
-    for found in (jacobian(of, at, vectorize=True), jacrev(of)(at)):
+    value, pull = vjp(of, at)
+    basis = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
+    rows = torch.stack([pull(row)[0] for row in basis]).reshape(expected.shape)
+    for found in (jacobian(of, at, vectorize=True), jacrev(of)(at), jacrev(of, chunk_size=1)(at), rows):
         torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-11)
 
 
