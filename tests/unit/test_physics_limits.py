@@ -165,6 +165,12 @@ def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     assert abs(after[1] - 0.1 + 2 * after[0]) < 1e-9
 
 
+def test_what_is_driven_in_quasi_static_motion_stops_at_the_limits_of_its_joint():
+    model, x = load(DRAWER.format(""), '<actuator><position joint="j" kp="9"/></actuator>'), torch.tensor([0.15])
+    torch.testing.assert_close(MujocoLCS(model).action_bounds(x), (torch.tensor([-0.15]), torch.tensor([0.05])))
+    assert MujocoLCS(model, limits=0).action_bounds(x)[1].isinf()
+
+
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
 def test_a_rope_tows_what_has_no_velocity(motion):
     slides = "".join(f'<body pos="0 {i} 0"><joint name="{name}" type="slide" axis="1 0 0" frictionloss=".01"/>'

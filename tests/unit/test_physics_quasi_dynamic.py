@@ -33,13 +33,13 @@ def test_a_free_body_has_the_mobility_of_its_inertia():
 
 
 @pytest.mark.parametrize(("kp", "damping"), [(1, 0.1), (3, 0.05), (0.2, 1), (400, 8)])
-@pytest.mark.parametrize("joint", ['gear="2"', "tendon"])
+@pytest.mark.parametrize("joint", ['gear="2"', "tendon", "site"])
 def test_a_servo_goes_the_way_that_mujoco_simulates(kp, damping, joint):
     """Damped so that its momentum is gone long before the step is over."""
-    drive = f'joint="j" {joint}' if joint != "tendon" else 'tendon="t"'
-    body = (
-        f'<body><joint name="j" damping="{damping}" stiffness=".1"/><geom size=".02" pos=".05 0 0" mass=".01"/></body>'
-    )
+    at = {"tendon": 'tendon="t"', "site": 'site="s" gear="0 0 0 0 0 2"'}  # the force at a site alone does not fall
+    drive = at.get(joint, f'joint="j" {joint}')
+    body = f'<body><joint name="j" damping="{damping}" stiffness=".1"/><geom size=".02" pos=".05 0 0" mass=".01"/>'
+    body += '<site name="s"/></body>'
     rest = f'<actuator><position {drive} kp="{kp}"/></actuator>'
     if joint == "tendon":
         rest = '<tendon><fixed name="t"><joint joint="j" coef="2"/></fixed></tendon>' + rest

@@ -15,8 +15,10 @@ from difflcs.physics.mujoco.native import flags
 Array = NDArray[np.float64]
 
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
+_JOINTS = _JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _FIXED, _UNBIASED, _AFFINE = (
     int(v) for v in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 )
@@ -30,12 +32,17 @@ _NONE, _INTEGRATOR, _FILTER, _EXACT, _MUSCLE, _USER = DYNAMICS = tuple(
 class Actuators:
     """The actuators of a model: which are position servos on joints, which joints they move, and what limits them.
 
+    Args:
+        model: the model.
+        stops: False if joints have no limits.
+
     Attributes:
         dof: (nu,) degree of freedom of each actuator on a slide or hinge; −1 for others.
         gear: (nu,).
         servo: (nu,) True for a `position` actuator on a slide or hinge.
         offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
-        holds: (nu,) True if its force falls to zero at some length, as that of servos on joints, tendons or sites does.
+        drifts: (nu,) True if MuJoCo gives it the length zero wherever it is: on free joints, on sites without refsite.
+        holds: (nu,) True if its force falls to zero at some length, as that of servos on joints or tendons does.
         follows: (nu,) True if it has no activation, or one that goes to its control.
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
@@ -46,12 +53,13 @@ class Actuators:
         curved: (k,) those with a range whose force is not linear in the control, such as dampers and muscles.
     """
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Any, stops: bool):
         joint = model.actuator_trnid[:, 0]
-        on_joint = model.actuator_trntype == _JOINT
         self.dof = np.full(model.nu, -1)
-        for i in np.flatnonzero(on_joint):
-            if model.jnt_type[joint[i]] in _SCALAR:
+        self.drifts = (model.actuator_trntype == _SITE) & (model.actuator_trnid[:, 1] < 0)
+        for i in np.flatnonzero(np.isin(model.actuator_trntype, _JOINTS)):
+            self.drifts[i] = (kind := model.jnt_type[joint[i]]) == _FREE
+            if model.actuator_trntype[i] == _JOINT and kind in _SCALAR:
                 self.dof[i] = model.jnt_dofadr[joint[i]]
         self.gear = model.actuator_gear[:, 0].copy()
         affine = model.actuator_biastype == _AFFINE
@@ -61,7 +69,7 @@ class Actuators:
         fixed = (model.actuator_gaintype == _FIXED) & (gain != 0) & self.follows
         linear = fixed & affine
         self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
-        self.holds = linear & (bias != 0)
+        self.holds = linear & (bias != 0) & ~self.drifts
         self._gain, self._constant, self._bias, self._damping = np.where(gain != 0, gain, 1.0), constant, bias, damping
         self.offset = np.where(self.servo, constant / self._gain, 0.0)
         limited = np.array(model.actuator_ctrllimited, dtype=bool)
@@ -70,7 +78,9 @@ class Actuators:
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
         slides = self.holds & (self.dof >= 0) & (model.jnt_type[model.dof_jntid[self.dof]] == _SCALAR[0])
         joints = model.dof_jntid[self.dof]
-        width = np.ptp(model.jnt_range[joints], axis=1) * model.jnt_limited[joints]
+        limited = model.jnt_limited[joints].astype(bool)
+        width = np.ptp(model.jnt_range[joints], axis=1) * limited
+        self._stops = np.where(limited & (self.dof >= 0) & stops, model.jnt_range[joints].T, [[-np.inf], [np.inf]])
         self.usual = np.where(slides, 1.5 * np.abs(self.gear) * width, 1.0)
         self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
@@ -154,10 +164,11 @@ class Actuators:
         return low - length, high - length
 
     def places(self, x: Array) -> tuple[Array, Array]:
-        """Compute how far joints of servos may go (..., nu) within their range, from positions that x begins with."""
+        """Compute how far driven joints may go (..., nu), in the range of controls and up to their stops, from x."""
         moves = np.where(self.servo & (self.gear != 0), self.gear, 1.0)
         low, high = np.sort([(end + self.offset - self._length(x)) / moves for end in self.range], axis=0)
-        return np.where(self.servo, low, -np.inf), np.where(self.servo, high, np.inf)
+        first, last = (stop - x[..., self.dof.clip(0)] for stop in self._stops)
+        return np.maximum(np.where(self.servo, low, first), first), np.minimum(np.where(self.servo, high, last), last)
 
     def control(self, x: Tensor, u: Tensor, relative: bool, quasi_static: bool) -> Tensor:
         """Convert actions u (..., nu) at states x (..., n_x) to controls.

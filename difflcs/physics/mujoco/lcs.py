@@ -147,7 +147,8 @@ class MujocoLCS:
         self._equality = Equality(model, self._data)
         self._rows = RowFinder(model, self._data, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
-        self._actuators, self._relative = Actuators(model), relative
+        stops = limits != 0 and not disabled & flags("CONSTRAINT", "LIMIT")
+        self._actuators, self._relative = Actuators(model, stops), relative
         self._quasi_static = motion == "quasi-static"
         mobility = mobility if isinstance(mobility, str) else check_array("mobility", mobility)
         if self._quasi_static:
@@ -300,8 +301,9 @@ class MujocoLCS:
     def action_bounds(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the bounds (..., n_u) of the actions within which actuators do what the system says.
 
-        These are `ctrlrange`, and unless motion is quasi-static `forcerange`, and `actuatorfrcrange` of joints with one
-        actuator; the layer keeps within them. Infinite where nothing is limited.
+        These are `ctrlrange`; `forcerange`, and `actuatorfrcrange` of joints with one actuator, or in quasi-static
+        motion, where no force holds back what is driven, the stops of joints. The layer keeps within them. Infinite
+        where nothing is limited.
 
         Args:
             x: (..., n_x) states.

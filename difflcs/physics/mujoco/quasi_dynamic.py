@@ -87,7 +87,7 @@ class QuasiDynamic:
         )
         self._bias = model.actuator_biasprm[:, :3] * (model.actuator_biastype == BIASES[1])[:, None]
         for force in (self._gain, self._bias):
-            force[disabled_actuators(model)] = 0.0
+            force[disabled_actuators(model)], force[actuators.drifts, 1] = 0.0, 0.0
         springs, dampers = (not model.opt.disableflags & flags(name) for name in ("SPRING", "DAMPER"))
         self._tendons = model.tendon_stiffness * springs, model.tendon_damping * dampers
         self._servo_damping = getattr(model, "actuator_damping", np.zeros(model.nu)) * dampers
