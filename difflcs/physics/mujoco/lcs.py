@@ -301,9 +301,8 @@ class MujocoLCS:
     def action_bounds(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the bounds (..., n_u) of the actions within which actuators do what the system says.
 
-        These are `ctrlrange`; `forcerange`, and `actuatorfrcrange` of joints with one actuator, or in quasi-static
-        motion, where no force holds back what is driven, the stops of joints. The layer keeps within them. Infinite
-        where nothing is limited.
+        These are `ctrlrange`, `forcerange` and, of joints with one actuator, `actuatorfrcrange`; in quasi-static motion
+        `ctrlrange` and the stops of joints. The layer keeps within them. Infinite where nothing is limited.
 
         Args:
             x: (..., n_x) states.
