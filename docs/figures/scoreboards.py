@@ -3,9 +3,10 @@
     pip install gym-pushany gymnasium-robotics trifinger-rl-datasets
     python docs/figures/scoreboards.py pushany fetch_push fetch_slide trifinger_push trifinger_lift
     python docs/figures/scoreboards.py trifinger_turn --assets DIR
+    python docs/figures/scoreboards.py leap_cube --judo DIR
 
-Each needs the package of its benchmark, the last one the folder `envs` of
-github.com/asu-iris/Complementarity-Free-Dexterous-Manipulation.
+Each needs the package of its benchmark. That of trifinger_turn is the folder `envs` of
+github.com/asu-iris/Complementarity-Free-Dexterous-Manipulation, that of leap_cube is judo-rai, in a folder of its own.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ class Options:
     """Which films; all that need no assets by default."""
     assets: Path = Path("envs")
     """Folder of the published models of trifinger_turn."""
+    judo: Path | None = None
+    """Folder in which Judo is installed, for leap_cube."""
 
 
 class Camera:
@@ -186,6 +189,28 @@ def trifinger_lift(o: Options) -> None:
     save("trifinger_lift", bullet(LiftPolicy(), "trifinger-cube-lift-sim-expert-v0", 1500, 20), 25, 32)
 
 
+def leap_cube(o: Options) -> None:
+    """Twenty seconds of Judo's leap_cube, in real time; the cube above the hand shows the goal."""
+    import leap_cube as leap
+
+    from difflcs.errors import ContactWarning
+
+    warnings.simplefilter("ignore", ContactWarning)
+    episode = leap.Episode(leap.load_judo(o.judo), 5001)
+    task, policy = episode.task, leap.Ours(episode.task, leap.Options())
+    model = task.sim_model
+    model.site_rgba[:, 3] = 0.0  # Judo's sites for traces, one of which is larger than the hand
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.25, 0.7
+    model.geom("cube").rgba[:3], model.geom("cube_vis").rgba[:3] = (0.3, 0.6, 1.0), (0.3, 0.9, 0.6)
+    camera = Camera(model, (-0.05, -0.03, 0.16), 0.52, 310.0, -30.0)
+    frames: list[np.ndarray] = []
+    while task.data.time < 20.0:
+        episode.step(policy.control(task))
+        if task.data.time >= 0.1 * len(frames):
+            frames.append(camera.picture(task.data))
+    save("leap_cube", frames, 10, 32)
+
+
 def save(name: str, frames: list[Any], fps: float, colors: int) -> None:
     """Write a film."""
     path = FOLDER / f"{name}.gif"
@@ -194,7 +219,8 @@ def save(name: str, frames: list[Any], fps: float, colors: int) -> None:
 
 
 FILMS: dict[str, Callable[[Options], None]] = {
-    film.__name__: film for film in (pushany, fetch_push, fetch_slide, trifinger_push, trifinger_lift, trifinger_turn)
+    film.__name__: film
+    for film in (pushany, fetch_push, fetch_slide, trifinger_push, trifinger_lift, trifinger_turn, leap_cube)
 }
 
 
@@ -204,7 +230,7 @@ def main(o: Options) -> None:
     if unknown:
         raise SystemExit(f"expected some of {', '.join(FILMS)}, got {', '.join(sorted(unknown))}")
     torch.set_num_threads(1)
-    for name in o.names or list(FILMS)[:-1]:
+    for name in o.names or list(FILMS)[:-2]:
         FILMS[name](o)
 
 
