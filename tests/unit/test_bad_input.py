@@ -10,6 +10,7 @@ from torch.utils._pytree import tree_leaves
 
 from difflcs import (
     ConstraintSequence,
+    CostSequence,
     GoalCost,
     LCSModel,
     LCSMPCLayer,
@@ -24,7 +25,8 @@ from difflcs import (
 from difflcs import errors as e
 from difflcs._checks import check_tensor
 from difflcs.mpc import MPCProblem, Primal
-from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend, RelaxedBackend
+from difflcs.systems import block_along_wall, cart_pole_between_walls
 from tests.conftest import refuse
 
 NAN, INF = float("nan"), float("inf")
@@ -315,35 +317,173 @@ def test_layer_refuses_crossed_bounds_with_both_numbers(build, bounds):
     refuse(e.BoundsError, r"at index \(1, 1\)", layer(build), torch.zeros(2, 4).double(), u_min=one[0], u_max=one[1])
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "match"),
-    [
+# --- arguments ------------------------------------------------------------------------------------------------------
+
+
+def full(value, *shape):
+    return torch.full(shape, value, dtype=torch.float64)
+
+
+def problem(build, **change):
+    fields = {
+        **build.lcs_tensors(), **build.cost_tensors(), "u_min": full(-0.1, 2), "u_max": full(0.1, 2),
+        "x0": full(0.0, 5, 4), "horizon": 2, "relaxation": 1e-4,
+    }  # fmt: skip
+    return MPCProblem(**{**fields, **change})
+
+
+def rows(build, **change):
+    n = build.normal(0)
+    return LinearConstraints(**{"G": n(3, 4), "g": n(3), "E": n(3, 2), "weight": full(2.0, 3), **change})
+
+
+def rows_by_stage(build, **change):
+    return ConstraintSequence(
+        **{"G": full(1.0, 4, 3, 4), "g": full(1.0, 4, 3), "E": full(1.0, 3, 3, 2), "weight": 1.0, **change}
+    )
+
+
+def cost_by_stage(build, **change):
+    each = [build.cost_tensors(k) for k in range(3)]
+    fields = {name: torch.stack([t[name] for t in each]) for name in ("Q", "R", "q", "r")}
+    fields |= {k: each[0][k] for k in ("Q_final", "q_final")} | {"S": full(0.0, 3, 4, 2)}
+    return CostSequence(**{**fields, **change})
+
+
+LOW, SUPPORT = full(-1.0, 3, 2), torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)
+REFUSED = {  # a call that is right as it is, and what it refuses: changed arguments, the error, and what it says
+    "MPCProblem": (problem, [
         ({"horizon": 0}, e.InvalidInputError, "horizon: expected at least 1, got 0"),
         ({"horizon": 1.0}, e.DTypeError, "horizon: expected an int"),
         ({"relaxation": 0.0}, e.InvalidInputError, "relaxation: .*above 0, got 0"),
-        ({"x0": torch.zeros(4).double()}, e.ShapeError, "x0: expected"),
-        ({"E": torch.zeros(3, 3).double()}, e.ShapeError, r"E: expected \(3, 2\) or \(5, 3, 2\) or .*, got \(3, 3\)"),
-        (
-            {"E": torch.zeros(5, 3, 3, 2).double()},
-            e.ShapeError,
-            r"E: expected .* or \(5, 2, 3, 2\), got \(5, 3, 3, 2\)",
-        ),
-        ({"S": torch.zeros(2, 4).double()}, e.ShapeError, r"S: expected \(4, 2\) or .*, got \(2, 4\)"),
-        ({"g": torch.ones(3).double(), "G_x": torch.ones(2, 4).double()}, e.ShapeError, r"G_x: expected \(3, 4\) or"),
-        ({"g": torch.ones(1).double(), "price": -torch.ones(1).double()}, e.InvalidInputError, "price: .*got -1; "),
-        ({"u_min": torch.full((2,), INF).double()}, e.BoundsError, "u_min"),
-        ({"u_max": torch.full((2,), INF).double(), "barrier": 0.1}, e.BoundsError, "finite bounds with a barrier"),
-        ({"u_min": torch.ones(2).double()}, e.BoundsError, "u_min <= u_max, got 1.*0.1"),
-    ],
+        ({"x0": X}, e.ShapeError, "x0: expected"),
+        ({"E": full(0.0, 3, 3)}, e.ShapeError, r"E: expected \(3, 2\) or \(5, 3, 2\) or .*, got \(3, 3\)"),
+        ({"E": full(0.0, 5, 3, 3, 2)}, e.ShapeError, r"E: expected .* or \(5, 2, 3, 2\), got \(5, 3, 3, 2\)"),
+        ({"S": full(0.0, 2, 4)}, e.ShapeError, r"S: expected \(4, 2\) or .*, got \(2, 4\)"),
+        ({"g": full(1.0, 3), "G_x": full(1.0, 2, 4)}, e.ShapeError, r"G_x: expected \(3, 4\) or"),
+        ({"g": full(1.0, 1), "price": full(-1.0, 1)}, e.InvalidInputError, "price: .*got -1; "),
+        ({"u_min": full(INF, 2)}, e.BoundsError, "u_min"),
+        ({"u_max": full(INF, 2), "barrier": 0.1}, e.BoundsError, "finite bounds with a barrier"),
+        ({"u_min": ONE}, e.BoundsError, "u_min <= u_max, got 1.*0.1"),
+    ]),
+    "StageBounds": (lambda b, u_min=LOW, u_max=None: StageBounds(u_min, u_max), [
+        ({"u_min": full(0.1, 3, 2), "u_max": full(-0.1, 3, 2)}, e.BoundsError,
+         r"u_min <= u_max, got 0.1 and -0.1 at index \(0, 0\)"),
+        ({"u_min": full(0.1, 3, 2), "u_max": 0.0}, e.BoundsError, "u_min <= u_max, got 0.1 and 0"),
+        ({"u_min": full(INF, 3, 2)}, e.BoundsError, "u_min: expected at least one action that it allows"),
+        ({"u_min": full(-1.0, 2), "u_max": full(1.0, 3, 2)}, e.ShapeError,
+         r"u_min: expected a dimension of stages.*got \(2,\)"),
+        ({"u_min": full(-1.0, 4, 2), "u_max": full(1.0, 3, 2)}, e.ShapeError,
+         "u_min: expected 3 stages.*like u_max, got 4"),
+        ({"u_max": full(1.0, 3, 3)}, e.ShapeError, r"u_m..: expected shape \(\.\.\., H=3, n_u="),
+        ({"u_min": full(NAN, 3, 2)}, e.NonFiniteError, "u_min: expected numbers or infinity, got 6 NaN of 6"),
+        ({"u_min": -1.0, "u_max": 1.0}, e.InvalidInputError, "by_stage: expected at least one field by stage"),
+        ({"u_min": torch.zeros(3, 2, dtype=torch.int64)}, e.DTypeError, "u_min: expected float32 or float64"),
+        ({"u_max": "1"}, e.DTypeError, "u_max: expected a torch.Tensor, got str"),
+    ]),
+    "LinearConstraints": (rows, [
+        ({"G": full(1.0, 4)}, e.ShapeError, r"G: expected shape \(\.\.\., n_c, n_x\), got \(4,\)"),
+        ({"g": full(1.0, 2)}, e.ShapeError, r"g: expected shape \(\.\.\., n_c=3\), got \(2,\)"),
+        ({"E": full(1.0, 2, 2)}, e.ShapeError, r"E: expected shape \(\.\.\., n_c=3, n_u\), got \(2, 2\)"),
+        ({"weight": full(1.0, 4)}, e.ShapeError, r"weight: expected shape \(\.\.\., n_c=3\), got \(4,\)"),
+        ({"g": full(-INF, 3)}, e.InvalidInputError, "g: expected limits above −∞, got −∞; "),
+        ({"weight": 0.0}, e.InvalidInputError, "weight: expected a positive price .*got 0; leave out"),
+        ({"weight": -1}, e.InvalidInputError, "weight: expected a positive price .*got -1"),
+        ({"weight": NAN}, e.NonFiniteError, "weight: expected numbers or infinity, got 3 NaN"),
+        ({"weight": True}, e.DTypeError, "weight: expected a torch.Tensor, got bool"),
+        ({"G": full(NAN, 3, 4)}, e.NonFiniteError, "G: expected finite numbers, got 12"),
+        ({"G": full(INF, 3, 4)}, e.NonFiniteError, "G: expected finite numbers, got 12"),
+        ({"E": full(INF, 3, 2)}, e.NonFiniteError, "E: expected finite numbers, got 6"),
+        ({"g": full(NAN, 3)}, e.NonFiniteError, "g: expected numbers or infinity, got 3 NaN"),
+        ({"g": [1.0, [1.0], True]}, e.DTypeError, "g: expected a torch.Tensor, got list"),
+        ({"G": torch.ones(3, 4, dtype=torch.int64)}, e.DTypeError, "G: expected float32 or float64"),
+        ({"G": None}, e.DTypeError, "G: expected a torch.Tensor, got NoneType"),
+    ]),
+    "ConstraintSequence": (rows_by_stage, [
+        ({"g": full(1.0, 3)}, e.ShapeError, r"g: expected a dimension of stages .*got \(3,\)"),
+        ({"g": full(1.0, 5, 3)}, e.ShapeError, r"g: expected 4 stages, for a horizon of 3 like G, got 5"),
+        ({"E": full(1.0, 4, 3, 2)}, e.ShapeError, r"E: expected 3 stages, for a horizon of 3 like G, got 4"),
+        ({"G": full(1.0, 1, 3, 4)}, e.ShapeError, "G: expected at least 2 stages, got 1"),
+        ({"by_stage": ("h",)}, e.InvalidInputError, "by_stage: expected some of G, g, E, weight, got str 'h'"),
+        ({"g": full(-INF, 4, 3)}, e.InvalidInputError, "g: expected limits above −∞"),
+    ]),
+    "CostSequence": (cost_by_stage, [
+        ({"q": X}, e.ShapeError, r"q: expected a dimension of stages .*got \(4,\).*; say by by_stage"),
+        ({"q": full(0.0, 5, 4)}, e.ShapeError, r"q: expected 3 stages, .* like Q, got 5.*; give as many"),
+        ({"by_stage": ("Q_final",)}, e.InvalidInputError,
+         "by_stage: expected some of Q, R, q, r, S, got str 'Q_final'"),
+        ({"by_stage": "q"}, e.DTypeError, "by_stage: expected a tuple of names .*got str .q.; add a comma"),
+        ({"by_stage": ()}, e.InvalidInputError,
+         "by_stage: expected at least one field by stage, got none.*; use the class"),
+        ({"S": None, "Q": full(-1.0, 3, 4, 4)}, e.InvalidInputError, "Q: expected a positive semi-definite"),
+        ({"S": full(0.0, 3, 2, 4)}, e.ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\)"),
+        ({"S": torch.stack([full(0.0, 4, 2), full(30.0, 4, 2), full(0.0, 4, 2)])}, e.InvalidInputError, r"\[\[Q, S\]"),
+    ]),
+    "GoalCost.reach": (lambda b, n_x=3, n_u=2, **change: GoalCost.reach(n_x, n_u, **change), [
+        ({"goal_weight": (1.0, 2.0, 3.0, 4.0)}, e.ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 4"),
+        ({"goal_weight": ()}, e.ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 0"),
+        ({"goal_weight": -1.0}, e.InvalidInputError, "goal_weight: .*at least 0, got -1"),
+        ({"goal_weight": NAN}, e.InvalidInputError, "goal_weight: .*finite.*got nan"),
+        ({"goal_weight_final": (1.0, 2.0)}, e.ShapeError, "goal_weight_final: expected 3 weights.*got 2"),
+        ({"input_weight": 0.0}, e.InvalidInputError, "input_weight: .*above 0, got 0"),
+        ({"pairs": [(0, 3)], "pair_weight": 1.0}, e.InvalidInputError, r"pairs: .*0…2, got list"),
+        ({"pairs": [(1, 1)]}, e.InvalidInputError, r"pairs: .*different indices.*\(1, 1\)"),
+        ({"pair_weight": -2.0}, e.InvalidInputError, "pair_weight: .*got -2"),
+        ({"n_x": 0}, e.InvalidInputError, "n_x: expected at least 1, got 0"),
+        ({"n_u": 1.5}, e.DTypeError, "n_u: expected an int, got float 1.5"),
+        ({"dtype": torch.float16}, e.DTypeError, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
+    ]),
+    "LCSModel": (lambda b, support=SUPPORT: LCSModel(4, 2, 3, action_support=support), [
+        ({"support": SUPPORT[0]}, e.ShapeError, "action_support|u_min"),
+        ({"support": SUPPORT.expand(3, 2, 2)}, e.ShapeError, "action_support|u_min"),
+        ({"support": SUPPORT[:, :1]}, e.ShapeError, "action_support|u_min"),
+        ({"support": SUPPORT.flip(0)}, e.BoundsError, "action_support|u_min"),
+        ({"support": SUPPORT * NAN}, e.NonFiniteError, "action_support|u_min"),
+        ({"support": [[0.0, 0.0], [1.0, 1.0]]}, e.DTypeError, "action_support|u_min"),
+    ]),
+    "cart_pole_between_walls": (lambda b, **change: cart_pole_between_walls(**change), [
+        ({"cart_mass": 0.0}, e.InvalidInputError, "cart_mass"),
+        ({"wall_stiffness": -1.0}, e.InvalidInputError, "wall_stiffness"),
+        ({"dt": NAN}, e.InvalidInputError, "dt"),
+    ]),
+    "block_along_wall": (lambda b, **change: block_along_wall(**change), [
+        ({"friction": -0.1}, e.InvalidInputError, "friction"),
+        ({"face_angle": np.pi / 2}, e.InvalidInputError, "face_angle"),
+        ({"stick": 0.0}, e.InvalidInputError, "stick"),
+    ]),
+    "BatchedBackend": (lambda b, **change: BatchedBackend(**change), [
+        *(({name: value}, e.InvalidInputError, f"{name}: expected") for name, value in {
+            "restarts": 0, "tol": 0.0, "max_iter": 0, "shrink": 1.0, "homotopy": 0.5, "effort": "huge",
+        }.items()),
+        *(({"threads": n}, e.InvalidInputError, "threads: expected") for n in (0, -1, 10**6, 2**31)),
+    ]),
+    "IpoptBackend": (lambda b, **change: IpoptBackend(**change), [
+        ({"tol": 0.0}, e.InvalidInputError, "tol: .*above 0, got 0"),
+        ({"max_iter": 2.5}, e.DTypeError, "max_iter: expected an int, got float 2.5"),
+        ({"workers": 0}, e.InvalidInputError, "workers: expected at least 1, got 0"),
+        ({"workers": 2**31}, e.InvalidInputError, "workers: expected at most"),
+        ({"start": -1.0}, e.InvalidInputError, "start: .*got -1"),
+        ({"second_start": 0.0}, e.InvalidInputError, "second_start: .*got 0"),
+        ({"mu_init": NAN}, e.InvalidInputError, "mu_init: .*got nan"),
+    ]),
+    "RelaxedBackend": (lambda b, **change: RelaxedBackend(**change), [
+        *(({"penalties": wrong}, e.DTypeError, "penalties") for wrong in ((), 3.0, ("a",))),
+        ({"penalties": (-1.0,)}, e.InvalidInputError, "penalties"),
+        ({"tol": 0.0}, e.InvalidInputError, "tol"),
+        ({"residual_tol": -1.0}, e.InvalidInputError, "residual_tol"),
+        ({"threads": 0}, e.InvalidInputError, "threads"),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "error", "match"), [(name, *row) for name, (_, rows) in REFUSED.items() for row in rows]
 )
-def test_problem_refuses(build, change, error, match):
-    limit = torch.full((2,), 0.1, dtype=torch.float64)
-    fields = {
-        **build.lcs_tensors(), **build.cost_tensors(), "u_min": -limit, "u_max": limit,
-        "x0": torch.zeros(5, 4, dtype=torch.float64), "horizon": 2, "relaxation": 1e-4,
-    }  # fmt: skip
-    MPCProblem(**fields)
-    refuse(error, match, lambda: MPCProblem(**{**fields, **change}))
+def test_arguments_that_do_not_fit_are_refused(build, name, change, error, match):
+    call, _ = REFUSED[name]
+    call(build)
+    message = refuse(error, match, call, build, **change)
+    assert ";" in message or "Constraint" not in name, "no remedy"
 
 
 # --- the error tree -------------------------------------------------------------------------------------------------

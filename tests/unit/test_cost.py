@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs import CostSequence, GoalCost, QuadraticCost
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs import CostSequence, QuadraticCost
+from difflcs.errors import InvalidInputError, ShapeError
 from tests.conformance import judges
 from tests.conftest import refuse
 
@@ -87,27 +87,6 @@ def test_semidefinite_weights_are_accepted():
     QuadraticCost(ones, torch.eye(2).double(), zero)
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"goal_weight": (1.0, 2.0, 3.0, 4.0)}, ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 4"),
-        ({"goal_weight": ()}, ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 0"),
-        ({"goal_weight": -1.0}, InvalidInputError, "goal_weight: .*at least 0, got -1"),
-        ({"goal_weight": float("nan")}, InvalidInputError, "goal_weight: .*finite.*got nan"),
-        ({"goal_weight_final": (1.0, 2.0)}, ShapeError, "goal_weight_final: expected 3 weights.*got 2"),
-        ({"input_weight": 0.0}, InvalidInputError, "input_weight: .*above 0, got 0"),
-        ({"pairs": [(0, 3)], "pair_weight": 1.0}, InvalidInputError, r"pairs: .*0…2, got list"),
-        ({"pairs": [(1, 1)]}, InvalidInputError, r"pairs: .*different indices.*\(1, 1\)"),
-        ({"pair_weight": -2.0}, InvalidInputError, "pair_weight: .*got -2"),
-        ({"n_x": 0}, InvalidInputError, "n_x: expected at least 1, got 0"),
-        ({"n_u": 1.5}, DTypeError, "n_u: expected an int, got float 1.5"),
-        ({"dtype": torch.float16}, DTypeError, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
-    ],
-)
-def test_reach_refuses_what_it_cannot_use(change, error, message):
-    refuse(error, message, GoalCost.reach, **{"n_x": 3, "n_u": 2, **change})
-
-
 # --- cross terms ----------------------------------------------------------------------------------------------------
 
 
@@ -138,42 +117,6 @@ def test_semidefinite_weights_with_cross_terms_are_accepted():
     eye = torch.eye(2, dtype=torch.float64)
     QuadraticCost(eye, eye, eye, S=eye)
     refuse(InvalidInputError, r"smallest eigenvalue -1\.000e-06", QuadraticCost, eye, eye, eye, S=(1 + 1e-6) * eye)
-
-
-# --- costs by stage ---------------------------------------------------------------------------------------------------
-
-
-def by_stage(build, horizon=3, **more):
-    each = [build.cost_tensors(k) for k in range(horizon)]
-    fields = {name: torch.stack([t[name] for t in each]) for name in ("Q", "R", "q", "r")}
-    return {**fields, **{k: each[0][k] for k in ("Q_final", "q_final")}, **more}
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"q": torch.zeros(4).double()}, ShapeError,
-         r"q: expected a dimension of stages .*got \(4,\).*; say by by_stage"),
-        ({"q": torch.zeros(5, 4).double()}, ShapeError, r"q: expected 3 stages, .* like Q, got 5.*; give as many"),
-        ({"by_stage": ("Q_final",)}, InvalidInputError,
-         "by_stage: expected some of Q, R, q, r, S, got str 'Q_final'"),
-        ({"by_stage": "q"}, DTypeError, "by_stage: expected a tuple of names .*got str .q.; add a comma"),
-        ({"by_stage": ()}, InvalidInputError,
-         "by_stage: expected at least one field by stage, got none.*; use the class"),
-        ({"Q": -torch.ones(3, 4, 4).double()}, InvalidInputError, "Q: expected a positive semi-definite"),
-        ({"S": torch.zeros(3, 2, 4).double()}, ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\)"),
-    ],
-)  # fmt: skip
-def test_a_sequence_refuses_what_does_not_fit(build, change, error, message):
-    refuse(error, message, CostSequence, **by_stage(build, **change))
-
-
-def test_cross_terms_of_one_stage_are_checked(build):
-    tensors = by_stage(build)
-    S = torch.zeros(3, 4, 2).double()
-    CostSequence(**tensors, S=S)
-    S[1, 0, 0] = 30.0
-    refuse(InvalidInputError, r"\[\[Q, S\]", CostSequence, **tensors, S=S)
 
 
 # --- references ---------------------------------------------------------------------------------------------------

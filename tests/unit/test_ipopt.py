@@ -1,4 +1,4 @@
-"""Backend `ipopt`: worker processes, threads, forks, crashes and options; and the registry of the backends."""
+"""Backend `ipopt`: worker processes, threads, forks and crashes; and the registry of the backends."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
 from difflcs.cli.bench import pushing_model, states_and_goals
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.errors import DTypeError
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
 from difflcs.systems import pushing_cost
@@ -169,23 +169,6 @@ def test_the_better_of_two_starts_is_kept():
         costs.append(layer(*states_and_goals(8, 1)).objective)
     assert float((costs[1] - costs[2]).abs().max()) > 1e-3
     torch.testing.assert_close(costs[0], torch.minimum(costs[1], costs[2]))
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"tol": 0.0}, InvalidInputError, "tol: .*above 0, got 0"),
-        ({"max_iter": 2.5}, DTypeError, "max_iter: expected an int, got float 2.5"),
-        ({"workers": 0}, InvalidInputError, "workers: expected at least 1, got 0"),
-        ({"workers": 2**31}, InvalidInputError, "workers: expected at most"),
-        ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
-        ({"second_start": 0.0}, InvalidInputError, "second_start: .*got 0"),
-        ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
-    ],
-)
-def test_options_are_checked(options, error, message):
-    with pytest.raises(error, match=message):
-        IpoptBackend(**options)
 
 
 # --- registry -------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from difflcs import LCSModel
-from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.errors import CheckpointError, InvalidInputError, ShapeError
 from tests.conftest import refuse
 
 
@@ -77,21 +77,6 @@ def test_an_action_support_is_saved_and_can_be_taken_away(tmp_path):
     model.action_support = None
     model.double().save_pretrained(tmp_path / "without")
     assert LCSModel.from_pretrained(tmp_path / "without").action_support is None
-
-
-@pytest.mark.parametrize(
-    ("support", "error"),
-    [
-        (SUPPORT[0], ShapeError),
-        (SUPPORT.expand(3, 2, 2), ShapeError),
-        (SUPPORT[:, :1], ShapeError),
-        (SUPPORT.flip(0), BoundsError),
-        (SUPPORT * torch.nan, NonFiniteError),
-        ([[0.0, 0.0], [1.0, 1.0]], DTypeError),
-    ],
-)
-def test_an_action_support_that_is_none_is_refused(support, error):
-    refuse(error, r"action_support|u_min", LCSModel, 4, 2, 3, action_support=support)
 
 
 def test_a_file_with_a_crossed_action_support_is_refused():
