@@ -1,7 +1,9 @@
 """Shared builders of small models, as fixtures; and how many threads the tests may use."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 # With several workers of pytest-xdist at once, the processes that a test starts take their share of the cores. It has
 # to be said before NumPy and torch are loaded.
@@ -20,6 +22,8 @@ from difflcs import DiffLCSError, GoalCost, LCSModel, LCSParams, QuadraticCost
 # Tests about threads say themselves how many they want, until they end.
 torch.set_num_threads(1)
 
+F64 = torch.float64
+
 
 @pytest.fixture(autouse=True)
 def one_thread():
@@ -33,6 +37,15 @@ def refuse(error, match: str, function: Callable, *args, **kwargs) -> str:
         function(*args, **kwargs)
     assert isinstance(caught.value, DiffLCSError)
     return str(caught.value)
+
+
+def tensor(values: Sequence[Any] | float) -> Tensor:
+    return torch.tensor(values, dtype=F64)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """The files of a folder and of those in it, by their paths."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 class Build:

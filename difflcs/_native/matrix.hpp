@@ -143,11 +143,8 @@ DIFFLCS_INLINE void multiply(Matrix<T, R, C, D> matrix, const W& vector, First f
       }
       store(i, a), store(i + 1, b), store(i + 2, c), store(i + 3, d);
     }
-    for (; i < matrix.rows; i++) store(i, first(i) + matrix.row(i) * vector);
-  } else {
-    DIFFLCS_UNROLL
-    for (; i < matrix.rows; i++) store(i, first(i) + matrix.row(i) * vector);
   }
+  for (; i < matrix.rows; i++) store(i, first(i) + matrix.row(i) * vector);
 }
 
 // to = first + matrix^T vector, several columns at a time, none of which waits for the sum of another.

@@ -26,6 +26,7 @@ from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, stored_config, sum_seconds, train
 from difflcs.rl.tasks import register_task
 from tests.conformance.toy import STEPS, make_task
+from tests.conftest import refuse
 
 pytestmark = pytest.mark.usefixtures("registered")
 
@@ -221,8 +222,7 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
     foreign["of other sizes"] = copy_state(larger.state_dict())
     foreign["nothing"] = {}
     for source, state in foreign.items():
-        with pytest.raises(CheckpointError, match="expected"):
-            trainer.load(state)
+        refuse(CheckpointError, "expected", trainer.load, state)
         assert same(trainer.state_dict(), before), source
 
 
@@ -253,8 +253,7 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     state = load_checkpoint(finished(other).checkpoints)
     save_checkpoint(run.checkpoints, state["iteration"], state)
     files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-    with pytest.raises(CheckpointError, match="another method"):
-        train(make_config(name), run.path, resume=True)
+    refuse(CheckpointError, "another method", train, make_config(name), run.path, resume=True)
     if make_config(other).method.kind != make_config(name).method.kind:
         with pytest.raises(CheckpointError):
             load_policy(run, TOY)
@@ -302,8 +301,7 @@ def test_only_what_learned_a_model_gives_one(name, finished):
 
 
 def test_what_was_learned_of_other_sizes_is_refused(name, finished):
-    with pytest.raises(CheckpointError, match="expected"):
-        load_policy(finished(name), make_task(size=3))
+    refuse(CheckpointError, "expected", load_policy, finished(name), make_task(size=3))
 
 
 # --- evaluation -------------------------------------------------------------------------------------------------------
@@ -374,16 +372,13 @@ def test_lcs_rl_needs_more_data_than_its_warmup():
 @pytest.mark.parametrize("method", [None, 3, Method, type("Nameless", (get_method("violation"),), {"name": None})])
 def test_what_is_no_method_is_not_registered(method):
     before = method_names()
-    with pytest.raises(DTypeError, match="subclass of Method"):
-        register_method(method)
+    refuse(DTypeError, "subclass of Method", register_method, method)
     assert method_names() == before
 
 
 def test_an_unknown_method_gets_the_names_there_are():
-    with pytest.raises(InvalidInputError, match=r"lcs-rl, violation, ppo.*register_method"):
-        get_method("magic")
-    with pytest.raises(InvalidInputError, match="magic"):
-        TrainConfig(method="magic")
+    refuse(InvalidInputError, r"lcs-rl, violation, ppo.*register_method", get_method, "magic")
+    refuse(InvalidInputError, "magic", TrainConfig, method="magic")
 
 
 # --- a task of one's own, by the command line -------------------------------------------------------------------------

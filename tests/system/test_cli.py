@@ -29,6 +29,7 @@ from difflcs.rl.methods import LCSRLMethod, ViolationMethod, get_method, method_
 from difflcs.rl.runs import progress
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.training import TrainConfig
+from tests.conftest import contents
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -343,10 +344,6 @@ def test_an_existing_run_is_not_overwritten(capsys, finished):
     assert run(capsys, "train", "--out", finished, "--resume", "--seed", 0)[0] == 0
     assert run(capsys, "train", "--out", finished, "--resume")[0] == 0  # nothing left to do
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
-
-
-def contents(path):
-    return {file.relative_to(path): file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 
 def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monkeypatch):

@@ -118,8 +118,7 @@ def test_predictions_stay_near_the_data_and_finite():
 
 def test_nothing_can_be_played_from_nothing():
     env = make_rollouts().env
-    with pytest.raises(InvalidInputError, match="expected real episodes, got none"):
-        env.reset(seed=0)
+    refuse(InvalidInputError, "expected real episodes, got none", env.reset, seed=0)
 
 
 def test_foreseen_is_what_was_played():

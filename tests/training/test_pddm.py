@@ -12,6 +12,7 @@ from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.pddm import PDDM, PDDMSettings, Planner
 from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.settings import Epochs, Rollouts
+from tests.conftest import refuse
 from tests.training.slide import STEPS, U_MAX, make_envs
 
 NETWORKS = EnsembleSettings(networks=2, width=16, epochs=Epochs(20, 20, 16), learning_rate=1e-3)
@@ -37,8 +38,7 @@ def test_pddm_learns_to_reach():
     assert before < 0.5
     assert evaluate(env, trainer.policy, 40, 0, STEPS).success_rate > 0.9
     assert [report.env_steps for report in reports] == [60, 90, 120]
-    with pytest.raises(InvalidInputError, match="all of them are done"):
-        trainer.step()
+    refuse(InvalidInputError, "all of them are done", trainer.step)
 
 
 @pytest.mark.parametrize(("n_x", "n_u", "networks", "width"), [(2, 1, 1, 15), (3, 2, 2, 16), (9, 6, 3, 31)])
@@ -119,8 +119,7 @@ def test_planner_remembers_until_it_begins_anew():
     state, goal = torch.zeros(2, 1, dtype=torch.float64), torch.full((2, 1), 0.3, dtype=torch.float64)
     first = plan(state, goal).action
     assert not torch.equal(plan(state, goal).action, first)
-    with pytest.raises(InvalidInputError, match="begin"):
-        plan(state[:1], goal[:1])
+    refuse(InvalidInputError, "begin", plan, state[:1], goal[:1])
     plan.begin()
     assert torch.equal(plan(state, goal).action, first)
     plan.begin(seed=1)

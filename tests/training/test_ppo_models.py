@@ -7,6 +7,7 @@ import torch
 from difflcs.errors import CheckpointError
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
+from tests.conftest import refuse
 from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, recorded
 
 
@@ -109,7 +110,5 @@ def test_the_value_network_learns_from_what_the_estimator_says(actions):
 def test_a_state_without_models_is_refused():
     trainer = make_ppo()
     trainer.step()
-    with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        make_practising().load(trainer.state_dict())
-    with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        trainer.load(make_practising().state_dict())
+    refuse(CheckpointError, r"models.*other settings", make_practising().load, trainer.state_dict())
+    refuse(CheckpointError, r"models.*other settings", trainer.load, make_practising().state_dict())

@@ -18,7 +18,7 @@ from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
 from difflcs.rl.learning.state_tree import flatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from tests.conftest import refuse
+from tests.conftest import contents, refuse
 
 
 def make_model(seed: int) -> LCSModel:
@@ -36,10 +36,6 @@ def make_state(iteration: int) -> dict[str, Any]:
 
 def save(root: Path, iteration: int, **options: int) -> None:
     save_checkpoint(root, iteration, make_state(iteration), **options)
-
-
-def contents(root):
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 def assert_equal(loaded: Mapping[str, Any], iteration: int) -> None:

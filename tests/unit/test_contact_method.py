@@ -14,9 +14,8 @@ from difflcs.rl.learning.physics_fit import physics_loss
 from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
 from tests.conformance.toy import Guess, Slide, make_task
-from tests.conftest import refuse
+from tests.conftest import F64, refuse
 
-F64 = torch.float64
 SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)
 
 

@@ -9,6 +9,7 @@ from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.rl.rollout import collect, mpc_actions
 from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.runs.evaluate import evaluate
+from tests.conftest import refuse
 from tests.training.pusher import STEPS, Reach, make_envs, pusher
 
 SEEDS = [1, 2, 3, 4]
@@ -51,8 +52,7 @@ def test_evaluation_with_delay():
     )
     assert late.median_errors["position_error"] != on_time.median_errors["position_error"]
     assert late.median_errors["position_error"] != predicted.median_errors["position_error"]
-    with pytest.raises(InvalidInputError, match="delay"):
-        evaluate(make_envs(4), policy, 4, 0, STEPS, delay=-1)
+    refuse(InvalidInputError, "delay", evaluate, make_envs(4), policy, 4, 0, STEPS, delay=-1)
 
 
 def test_a_system_per_stage_predicts_no_single_step():
@@ -62,5 +62,4 @@ def test_a_system_per_stage_predicts_no_single_step():
         def params(self, x=None, context=None):
             return LCSSequence.stack([pusher()] * 2)
 
-    with pytest.raises(DTypeError, match="one step"):
-        played(1, make_predictor(Staged()))
+    refuse(DTypeError, "one step", played, 1, make_predictor(Staged()))

@@ -10,6 +10,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl.rollout import collect, mpc_actions
 from difflcs.rl.runs.evaluate import evaluate, wilson_interval
 from difflcs.rl.seeding import Stream, episode_seeds
+from tests.conftest import refuse
 from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
 
 
@@ -24,8 +25,7 @@ def test_wilson_interval_equals_scipy():
             assert ours == pytest.approx(
                 tuple(1 - v for v in wilson_interval(trials - successes, trials, confidence))[::-1]
             )
-    with pytest.raises(InvalidInputError, match="trials=3"):
-        wilson_interval(4, 3)
+    refuse(InvalidInputError, "trials=3", wilson_interval, 4, 3)
 
 
 def test_evaluation_does_not_depend_on_the_number_of_environments():
@@ -66,5 +66,4 @@ def test_what_is_counted_is_what_the_episodes_say():
 
 @pytest.mark.parametrize(("goals", "seed", "name"), [(0, 0, "goals"), (2, -1, "seed"), (True, 0, "goals")])
 def test_bad_numbers_are_refused(goals, seed, name):
-    with pytest.raises(InvalidInputError, match=name):
-        evaluate(make_envs(2), Reach(), goals, seed, STEPS)
+    refuse(InvalidInputError, name, evaluate, make_envs(2), Reach(), goals, seed, STEPS)

@@ -11,6 +11,7 @@ import torch
 
 from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError, MissingDependencyError
+from tests.conftest import contents
 
 
 @pytest.fixture
@@ -31,10 +32,6 @@ def test_a_training_refuses_a_path_that_is_no_text(name, tmp_path):
 def saved(model, tmp_path):
     model.save_pretrained(tmp_path / "saved")
     return tmp_path / "saved"
-
-
-def contents(directory):
-    return {p.name: p.read_bytes() for p in sorted(directory.iterdir()) if p.is_file()}
 
 
 def refuse(directory, match=None):

@@ -18,6 +18,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
 from difflcs.systems import pushing_cost
 from tests.conformance.varied.generators import random_case
+from tests.conftest import refuse
 
 
 @pytest.fixture
@@ -217,13 +218,11 @@ def test_a_backend_whose_package_is_missing_gives_the_pip_line(build):
 
 @pytest.mark.parametrize("backend", [None, 3, IpoptBackend])
 def test_something_that_is_no_backend_is_refused(build, backend):
-    with pytest.raises(DTypeError, match="backend: expected a name or a Backend instance"):
-        make_layer(build, backend=backend)
+    refuse(DTypeError, "backend: expected a name or a Backend instance", make_layer, build, backend=backend)
 
 
 @pytest.mark.parametrize("wrong", [int, "ipopt", IpoptBackend(), type("Nameless", (Backend,), {})])
 def test_only_backend_classes_with_a_name_are_registered(wrong):
     before = available_backends()
-    with pytest.raises(DTypeError, match="subclass of Backend with a `name`"):
-        register_backend(wrong)
+    refuse(DTypeError, "subclass of Backend with a `name`", register_backend, wrong)
     assert available_backends() == before

@@ -143,8 +143,7 @@ def test_a_plan_stays_within_the_actions_that_the_model_was_fitted_to(build, lay
     torch.testing.assert_close(layer(x0, u_min=-0.15, u_max=0.15).u.detach(), free, rtol=0, atol=1e-12)
     stages = StageBounds(torch.full((3, 2), -0.15, dtype=torch.float64), 0.15)
     torch.testing.assert_close(layer(x0, bounds=stages).u.detach(), free, rtol=0, atol=1e-7)
-    with pytest.raises(BoundsError, match="action_support to None"):
-        LCSMPCLayer(layer.lcs, layer.cost, 3, 0.02, 0.15)
+    refuse(BoundsError, "action_support to None", LCSMPCLayer, layer.lcs, layer.cost, 3, 0.02, 0.15)
     layer.lcs.action_support = None
     torch.testing.assert_close(layer(x0).u.detach(), free, rtol=0, atol=1e-12)
 
@@ -234,8 +233,7 @@ def test_a_backend_that_claims_success_is_judged_by_the_residual(build, x0):
                 problem, result.primal._replace(u=u), result.status, result.iterations, result.solve_time, tol=1e-6
             )
 
-    with pytest.raises(SolveError, match=r"2 of 6 .*2 NUMERICAL.*elements 3, 5"):
-        make_layer(build, backend=Liar())(x0)
+    refuse(SolveError, r"2 of 6 .*2 NUMERICAL.*elements 3, 5", make_layer(build, backend=Liar()), x0)
 
 
 # --- what a problem may be ------------------------------------------------------------------------------------------
@@ -420,8 +418,7 @@ def test_a_plan_is_drawn(layer, x0):
     assert len(actions.patches) == 3 * plan.u.shape[-1]  # each with two bounds
     assert len(forces.patches) == len(gaps.patches) == plan.lam.shape[-1]
     assert states.figure._repr_png_().startswith(b"\x89PNG")  # what a notebook shows
-    with pytest.raises(BatchIndexError, match=f"a batch of {len(x0)}"):
-        plan.plot(len(x0))
+    refuse(BatchIndexError, f"a batch of {len(x0)}", plan.plot, len(x0))
 
 
 @pytest.mark.slow

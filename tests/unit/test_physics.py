@@ -29,14 +29,9 @@ from difflcs.physics import (
 )
 from difflcs.physics.complementarity import count_forces
 from difflcs.physics.learnable import LEARNABLE
-from tests.conftest import refuse
+from tests.conftest import F64, refuse, tensor
 
-F64 = torch.float64
 L_SHAPE = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=F64)
 
 
 # --- shapes -----------------------------------------------------------------------------------------------------------

@@ -12,9 +12,8 @@ import torch
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS
-from tests.conftest import refuse
+from tests.conftest import F64, refuse
 
-F64 = torch.float64
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
 VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0, "loss": 0.2, "torsion": 0.01}
 OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6}

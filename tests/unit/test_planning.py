@@ -10,15 +10,10 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
-from tests.conftest import refuse
+from tests.conftest import F64, refuse, tensor
 
-F64 = torch.float64
 RADIUS = 0.1
 BLOCK = box(-0.5, 0.5, -0.5, 0.5)
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=F64)
 
 
 class Line:

@@ -9,14 +9,10 @@ from difflcs.physics import Circle, PlanarPushing, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, Obstacles, PlanarTravel
 from difflcs.planning.outline import clearance
+from tests.conftest import F64, tensor
 
-F64 = torch.float64
 BODY, RADIUS = box(-0.5, 0.5, -0.5, 0.5), 0.1
 WALL, BALL, TEE = box(-0.1, 0.1, -2.0, 2.0), Circle(0.4), Union((box(-0.6, 0.6, 0, 0.3), box(-0.2, 0.2, 0.3, 1.0)))
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=F64)
 
 
 def placed(*shapes_and_poses, **options):

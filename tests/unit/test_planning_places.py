@@ -13,9 +13,8 @@ from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, PlanarTravel, Workspace
 from difflcs.planning.outline import DistanceGrid, clearance, ring
-from tests.conftest import refuse
+from tests.conftest import F64, refuse, tensor
 
-F64 = torch.float64
 RADIUS = 0.15
 TEE = Union((box(-0.6, 0.6, -0.25, 0.05), box(-0.15, 0.15, 0.05, 0.95)))
 SHAPES = {
@@ -25,10 +24,6 @@ SHAPES = {
     "tee": TEE,
     "apart": Union((box(-0.5, -0.1, -0.2, 0.2), Circle(0.3, (0.4, 0.0)))),
 }
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=F64)
 
 
 # --- curves round a shape ---------------------------------------------------------------------------------------------

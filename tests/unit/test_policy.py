@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.rl.learning.policy import LCSMPCPolicy
+from tests.conftest import refuse
 
 U_MAX = 0.1
 STD = 0.02
@@ -99,5 +100,4 @@ def test_what_is_learned(mpc):
     ],
 )
 def test_bad_arguments(mpc, arguments, error, message):
-    with pytest.raises(error, match=message):
-        LCSMPCPolicy(**{"mpc": mpc, **arguments})
+    refuse(error, message, LCSMPCPolicy, **{"mpc": mpc, **arguments})

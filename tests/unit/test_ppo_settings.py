@@ -9,6 +9,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import make_actor
+from tests.conftest import refuse
 from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, make_mpc, small_settings
 
 
@@ -16,16 +17,13 @@ def test_bad_arguments_are_refused():
     options = {"features": features, "total_episodes": 20, "episode_steps": STEPS}
     mpc, settings = make_mpc(make_model()), small_settings()
     actor, make = make_actor(mpc, settings.std), ppo_settings.make_ppo
-    with pytest.raises(InvalidInputError, match="at least 12 environments, got 3"):
-        make(actor, make_envs(3), settings, 0, **options)
+    refuse(InvalidInputError, "at least 12 environments, got 3", make, actor, make_envs(3), settings, 0, **options)
     with pytest.raises(InvalidInputError, match="use an LCSModel"):
         make(make_actor(make_mpc(mpc.lcs.params().detach()), settings.std), make_envs(), settings, 0, **options)
     with pytest.raises(InvalidInputError, match="covariance='diagonal'"):
         make(actor, make_envs(), replace(settings, covariance="diagonal"), 0, **options)
-    with pytest.raises(InvalidInputError, match="shorten the warm-up"):
-        make(actor, make_envs(), settings, 0, **options, first_episode=20)
-    with pytest.raises(InvalidInputError, match="std_range"):
-        replace(settings, std_range=(0.2, 0.1))
+    refuse(InvalidInputError, "shorten the warm-up", make, actor, make_envs(), settings, 0, **options, first_episode=20)
+    refuse(InvalidInputError, "std_range", replace, settings, std_range=(0.2, 0.1))
     bound = torch.full((1,), U_MAX)
     network = make_actor(MLPController(features, 3, -bound, bound, 4, STEPS), settings.std)
     for changes in ({}, {"update": "adam", "beta": 0.5}):

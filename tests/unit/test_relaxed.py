@@ -11,6 +11,7 @@ from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend
 from tests.conformance.problems import Problem, badly_scaled, contact, make
 from tests.conformance.problems import solve as solve_problem
+from tests.conftest import refuse
 
 
 def tensors(build, **options):
@@ -211,8 +212,7 @@ def test_what_the_program_does_not_have_is_refused(build, calls, change, match):
     calls(lambda call, *_: pytest.fail("something was solved"))
     t = tensors(build)
     problem = MPCProblem(**{**t, **change(t)}, horizon=3, relaxation=1e-4)
-    with pytest.raises(InvalidInputError, match=match + r".*; use backend='batched' or 'ipopt'"):
-        RelaxedBackend().solve(problem, None)
+    refuse(InvalidInputError, match + r".*; use backend='batched' or 'ipopt'", RelaxedBackend().solve, problem, None)
 
 
 def test_it_can_be_pickled():

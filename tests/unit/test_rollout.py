@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from difflcs import solve_lcp
 from difflcs.errors import InvalidInputError
 from difflcs.rl.rollout import append_episodes, collect, make_empty_record, mpc_actions, noisy_actions
+from tests.conftest import refuse
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
 
@@ -44,10 +45,8 @@ def test_episodes_of_another_length_are_refused(length, got):
 
 def test_same_step_autoreset_is_refused():
     env = SyncVectorEnv([PusherEnv], autoreset_mode=AutoresetMode.SAME_STEP)
-    with pytest.raises(InvalidInputError, match="autoreset"):
-        collect(env, mpc_actions(Reach()), [1], STEPS)
-    with pytest.raises(InvalidInputError, match="num_envs=1"):
-        collect(make_envs(1), mpc_actions(Reach()), [1, 2], STEPS)
+    refuse(InvalidInputError, "autoreset", collect, env, mpc_actions(Reach()), [1], STEPS)
+    refuse(InvalidInputError, "num_envs=1", collect, make_envs(1), mpc_actions(Reach()), [1, 2], STEPS)
 
 
 def test_records_are_extended_by_stable_episodes_and_keep_the_newest():
@@ -60,8 +59,7 @@ def test_records_are_extended_by_stable_episodes_and_keep_the_newest():
     later = collect(make_envs(2), mpc_actions(Reach()), [3, 4], STEPS)
     assert torch.equal(append_episodes(known, later, keep=2)["goal"], later["goal"])
     assert len(append_episodes(known, later)) == 3
-    with pytest.raises(InvalidInputError, match="stable simulation"):
-        append_episodes(make_empty_record(env, STEPS), record[:1])
+    refuse(InvalidInputError, "stable simulation", append_episodes, make_empty_record(env, STEPS), record[:1])
 
 
 @pytest.mark.parametrize(
@@ -80,5 +78,4 @@ def test_an_environment_must_say_whether_it_succeeded_and_what_it_earned(reward,
     if match is None:
         assert bool(collect(SyncVectorEnv([Told]), mpc_actions(Reach()), [1], STEPS)["success"])
         return
-    with pytest.raises(InvalidInputError, match=match):
-        collect(SyncVectorEnv([Told]), mpc_actions(Reach()), [1], STEPS)
+    refuse(InvalidInputError, match, collect, SyncVectorEnv([Told]), mpc_actions(Reach()), [1], STEPS)

@@ -7,6 +7,7 @@ import torch
 
 from difflcs import LCSModel, ScaledLCS, suggest_scales
 from difflcs.errors import CheckpointError, DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from tests.conftest import refuse
 
 
 @pytest.fixture
@@ -79,10 +80,8 @@ def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_
     read = ScaledLCS.from_pretrained(tmp_path / "it")
     assert torch.equal(read(x, u).x_next, scaled(x, u).x_next)
     assert (read.scales.xi, read.scales.relaxation) == (scaled.scales.xi, scaled.scales.relaxation)
-    with pytest.raises(CheckpointError, match="ScaledLCS"):
-        LCSModel.from_pretrained(tmp_path / "it")
-    with pytest.raises(DTypeError, match="lcs: expected LCSModel"):
-        ScaledLCS(scaled, scaled.scales).save_pretrained(tmp_path / "other")
+    refuse(CheckpointError, "ScaledLCS", LCSModel.from_pretrained, tmp_path / "it")
+    refuse(DTypeError, "lcs: expected LCSModel", ScaledLCS(scaled, scaled.scales).save_pretrained, tmp_path / "other")
 
 
 def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
@@ -106,28 +105,25 @@ def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
 def test_transitions_that_cannot_be_used_are_refused(data, name):
     good = dict(zip(("x", "u", "x_next"), data, strict=True))
 
-    def refuse(error, match, value):
-        with pytest.raises(error, match=match):
-            suggest_scales(**{**good, name: value})
+    def refused(error, match, value):
+        refuse(error, match, suggest_scales, **{**good, name: value})
 
-    refuse(DTypeError, f"{name}: expected float32 or float64, got .*int64.*; convert", good[name].long())
-    refuse(DTypeError, rf"{name}: expected a torch.Tensor, got list.*; wrap", [*map(str, good[name][:, 0].tolist())])
-    refuse(DeviceError, f"{name}: expected a tensor with data.*; move", good[name].to("meta"))
+    refused(DTypeError, f"{name}: expected float32 or float64, got .*int64.*; convert", good[name].long())
+    refused(DTypeError, rf"{name}: expected a torch.Tensor, got list.*; wrap", [*map(str, good[name][:, 0].tolist())])
+    refused(DeviceError, f"{name}: expected a tensor with data.*; move", good[name].to("meta"))
     bad = good[name].clone()
     bad[3, 1] = torch.nan
-    refuse(NonFiniteError, rf"{name}: expected finite numbers, got 1 .* at index \(3, 1\).*; find", bad)
-    refuse(InvalidInputError, rf"{name}: expected shape \(\.\.\., n\) of many.*; give a batch", good[name][0])
-    refuse(ShapeError, "batch dimensions .* do not fit the others", good[name][:7])
+    refused(NonFiniteError, rf"{name}: expected finite numbers, got 1 .* at index \(3, 1\).*; find", bad)
+    refused(InvalidInputError, rf"{name}: expected shape \(\.\.\., n\) of many.*; give a batch", good[name][0])
+    refused(ShapeError, "batch dimensions .* do not fit the others", good[name][:7])
 
 
 def test_too_little_data_and_states_that_never_move_are_refused(data):
     x, u, x_next = data
     with pytest.raises(InvalidInputError, match="expected at least two transitions, got 1; give more data"):
         suggest_scales(x[:1], u[:1], x_next[:1])
-    with pytest.raises(InvalidInputError, match="x_next: expected states that change, got x itself; give"):
-        suggest_scales(x, u, x)
-    with pytest.raises(ShapeError, match=r"x_next: expected shape \(\.\.\., n_x=4\), got \(200, 3\)"):
-        suggest_scales(x, u, x_next[:, :3])
+    refuse(InvalidInputError, "x_next: expected states that change, got x itself; give", suggest_scales, x, u, x)
+    refuse(ShapeError, r"x_next: expected shape \(\.\.\., n_x=4\), got \(200, 3\)", suggest_scales, x, u, x_next[:, :3])
 
 
 def test_systems_and_data_of_other_sizes_are_refused(build, data):
@@ -152,5 +148,4 @@ def test_systems_and_data_of_other_sizes_are_refused(build, data):
     ],
 )
 def test_what_is_not_meant_is_refused(data, wrong, error, match):
-    with pytest.raises(error, match=match):
-        wrong(suggest_scales(*data))
+    refuse(error, match, wrong, suggest_scales(*data))

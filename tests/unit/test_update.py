@@ -11,7 +11,7 @@ from difflcs.rl import Adam, Natural
 from difflcs.rl.learning.optim import AdamUpdate, NaturalUpdate, StepSize
 from difflcs.rl.learning.optim.update import Deviation
 from difflcs.rl.learning.policy import make_actor
-from tests.training.slide import drawn, make_model, make_mpc
+from tests.training.slide import drawn, make_model, make_mpc, same
 
 STD = 0.03
 ADAM = Adam(learning_rate=0.02, betas=(0.9, 0.99))
@@ -36,10 +36,6 @@ def loss_of(actor, data=None) -> torch.Tensor:
 def values(actor) -> list[torch.Tensor]:
     gaussian = actor.gaussian
     return [p.detach().clone() for p in (*actor.learned.parameters(), gaussian.log_std, gaussian.mixing)]
-
-
-def same(a, b) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 @pytest.mark.parametrize(("kl", "factor"), [(0.04, 1.5), (0.06, 1.0), (0.14, 1.0), (0.16, 1 / 1.5), (math.nan, 1.0)])
