@@ -53,8 +53,8 @@ void expect(bool ok, const char* what) {
 int step(Guarded& self, Array x, std::optional<Array> targets, bool follow, Output u) {
   const Use controller(self);
   const difflcs::ControllerData& d = controller->data();
-  const int64_t aims = d.n_goal * (follow ? d.horizon + 1 : 1);
-  expect(int64_t(x.size()) == d.n_x && int64_t(u.size()) == d.n_u, "x must be (n_x,) and u (n_u,)");
+  const int64_t aims = d.n_goal * (follow ? d.batch.horizon + 1 : 1);
+  expect(int64_t(x.size()) == d.batch.n_x && int64_t(u.size()) == d.batch.n_u, "x must be (n_x,) and u (n_u,)");
   expect((targets ? int64_t(targets->size()) : 0) == aims, "targets must be (n_goal,) or (H + 1, n_goal)");
   const nb::gil_scoped_release release;
   return int(controller->step(x.data(), targets ? targets->data() : nullptr, follow, u.data()).status);
@@ -63,12 +63,12 @@ int step(Guarded& self, Array x, std::optional<Array> targets, bool follow, Outp
 nb::dict sizes(const Guarded& self) {
   const difflcs::ControllerData& d = self.controller.data();
   nb::dict data;
-  data["n_x"] = d.n_x;
-  data["n_u"] = d.n_u;
-  data["n_lam"] = d.n_lam;
-  data["n_c"] = d.n_c;
+  data["n_x"] = d.batch.n_x;
+  data["n_u"] = d.batch.n_u;
+  data["n_lam"] = d.batch.n_lam;
+  data["n_c"] = d.batch.n_c;
   data["n_goal"] = d.n_goal;
-  data["horizon"] = d.horizon;
+  data["horizon"] = d.batch.horizon;
   data["step_seconds"] = d.step_seconds;
   data["isa"] = self.controller.kernels().isa;
   return data;
@@ -76,8 +76,9 @@ nb::dict sizes(const Guarded& self) {
 
 nb::tuple outcome(Guarded& self) {
   const Use controller(self);
-  const difflcs::Outcome& o = controller->outcome();
-  return nb::make_tuple(int(o.status), o.fallback, o.late, o.iterations, o.objective, o.residual, o.solve_seconds);
+  const difflcs_outcome& o = controller->outcome();
+  return nb::make_tuple(int(o.status), o.fallback != 0, o.late != 0, o.iterations, o.objective, o.residual,
+                        o.solve_seconds);
 }
 
 void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
@@ -95,8 +96,8 @@ void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
 void set_fallback(Guarded& self, int kind, std::optional<Array> action) {
   const Use controller(self);
   expect(kind >= 0 && kind <= 3, "the kind must be from 0 to 3");
-  expect(kind != 2 || (action && int64_t(action->size()) == controller->data().n_u), "the action must be (n_u,)");
-  controller->set_fallback(difflcs::Fallback(kind), action ? action->data() : nullptr);
+  expect(kind != 2 || (action && int64_t(action->size()) == controller->data().batch.n_u), "the action must be (n_u,)");
+  controller->set_fallback(difflcs_fallback(kind), action ? action->data() : nullptr);
 }
 
 void set_inputs(Guarded& self, std::vector<Array> values, double constant) {

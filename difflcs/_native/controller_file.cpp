@@ -120,13 +120,10 @@ void check_limits(const ControllerData& data) {
         refuse(std::string(kMpcFields[which].name) + ": expected limits that can be met, got " + std::to_string(value));
     }
   }
-  for (int64_t k = 0; k < data.horizon; k++)
-    for (int64_t j = 0; j < data.n_u; j++) {
-      const auto at = [&](Input which) {
-        return data.field[which].get()[(data.by_stage[which] ? k * data.n_u : 0) + j];
-      };
-      if (!(at(ku_min) <= at(ku_max))) refuse("u_min: expected at most u_max");
-    }
+  for (int64_t i = 0; i < data.batch.horizon * data.batch.n_u; i++) {
+    const Bound bound(data.batch, 0, i);
+    if (!(bound.low <= bound.high)) refuse("u_min: expected at most u_max");
+  }
 }
 
 }  // namespace
@@ -134,22 +131,25 @@ void check_limits(const ControllerData& data) {
 ControllerData read_controller(const void* bytes, size_t size) {
   Reader reader(bytes, size);
   ControllerData data{};
-  data.n_x = reader.size("n_x", 1);
-  data.n_u = reader.size("n_u", 1);
-  data.n_lam = reader.size("n_lam", 0);
-  data.n_c = reader.size("n_c", 0);
-  data.horizon = reader.size("horizon", 1);
+  MpcBatch& batch = data.batch;
+  MpcEffort& effort = data.effort;
+  batch.count = batch.version = 1;
+  batch.n_x = reader.size("n_x", 1);
+  batch.n_u = reader.size("n_u", 1);
+  batch.n_lam = reader.size("n_lam", 0);
+  batch.n_c = reader.size("n_c", 0);
+  batch.horizon = reader.size("horizon", 1);
   data.n_goal = reader.size("n_goal", 0);
   constexpr double kSmallestNumber = std::numeric_limits<double>::min();
-  data.relaxation = reader.number("relaxation", kSmallestNumber);
-  data.barrier = reader.number("barrier", 0);
-  data.tol = reader.number("tol", kSmallestNumber);
-  data.certified = reader.number("certified", kSmallestNumber);
-  data.homotopy = reader.number("homotopy", 0);
-  data.shrink = reader.number("shrink", kSmallestNumber, 1 - 1e-12);
-  data.max_iter = reader.size("max_iter", 1, kLargestCount);
-  data.seed = reader.size("seed", 0, kLargestCount);
-  data.starts = reader.size("starts", 1);
+  batch.relaxation = reader.number("relaxation", kSmallestNumber);
+  batch.barrier = reader.number("barrier", 0);
+  effort.tol = reader.number("tol", kSmallestNumber);
+  effort.certified = reader.number("certified", kSmallestNumber);
+  effort.homotopy = reader.number("homotopy", 0);
+  effort.shrink = reader.number("shrink", kSmallestNumber, 1 - 1e-12);
+  effort.max_iter = reader.size("max_iter", 1, kLargestCount);
+  effort.seed = uint64_t(reader.size("seed", 0, kLargestCount));
+  effort.starts = reader.size("starts", 1);
   data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);
   for (int i = 0; i < kInputs; i++) {
@@ -157,14 +157,16 @@ ControllerData read_controller(const void* bytes, size_t size) {
     const Field& field = kMpcFields[i];
     const bool may_be_infinite = i == ku_min || i == ku_max || i == kg || i == kprice;
     data.field[i] = reader.take(field.name);
-    const int64_t once = extent(data, field), stages = stages_of(data, field);
-    data.by_stage[i] = stages > 0 && once > 0 && data.field[i].count() == stages * once && stages > 1;
-    if (!data.by_stage[i]) Reader::expect_count(field.name, data.field[i], once);
+    const int64_t once = extent(batch, field), stages = stages_of(batch, field);
+    const bool by_stage = stages > 1 && once > 0 && data.field[i].count() == stages * once;
+    if (!by_stage) Reader::expect_count(field.name, data.field[i], once);
+    batch.input[i] = data.field[i].get();
+    batch.step[i] = by_stage ? once : 0;
     for (int64_t j = 0; !may_be_infinite && j < data.field[i].count(); j++)
       if (!std::isfinite(data.field[i].get()[j]))
         refuse(std::string(field.name) + ": expected finite numbers, got another");
   }
-  const int64_t map = data.n_x * data.n_goal, square = data.n_goal * data.n_goal;
+  const int64_t map = batch.n_x * data.n_goal, square = data.n_goal * data.n_goal;
   data.goal_to_q = reader.take("goal_to_q", map);
   data.goal_to_q_final = reader.take("goal_to_q_final", map);
   data.goal_stage = reader.take("goal_stage", square);

@@ -12,7 +12,7 @@
 #include <memory>
 #include <new>
 
-#include "fields.hpp"
+#include "search.hpp"
 
 namespace difflcs {
 
@@ -38,20 +38,17 @@ class Numbers {
   std::unique_ptr<double, Free> data_;
 };
 
-// One problem with its solver's options. The names are those of MpcBatch, MpcEffort and GoalCost (difflcs/cost.py).
+// One problem with its solver's options. Other names are those of GoalCost (difflcs/cost.py).
 struct ControllerData {
-  int64_t n_x, n_u, n_lam, n_c, horizon;
-  int64_t n_goal;  // 0: the cost knows no goal
-  double relaxation, barrier, tol, certified;
-  double homotopy, shrink;
-  int64_t max_iter, seed, starts, starts_guessed;  // without a guess, and with one
-  double step_seconds;                             // time from one step to the next [s]; 0 if not known
-  Numbers field[kInputs];                          // all but x0
-  bool by_stage[kInputs];
+  MpcBatch batch;                      // this problem alone, with the fields below
+  MpcEffort effort;                    // without a guess
+  int64_t starts_guessed;              // with one
+  int64_t n_goal;                      // 0: the cost knows no goal
+  double step_seconds;                 // time from one step to the next [s]; 0 if not known
+  Numbers field[kInputs];              // all but x0
   Numbers goal_to_q, goal_to_q_final;  // (n_x, n_goal)
   Numbers goal_stage, goal_final;      // (n_goal, n_goal)
   double constant;                     // of the objective
-  static constexpr int64_t count = 1;
 };
 
 // Reads the bytes of a file. Throws std::runtime_error that says what is wrong with them, and std::bad_alloc.

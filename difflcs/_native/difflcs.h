@@ -9,9 +9,9 @@
  *     }
  *     difflcs_free(controller);
  *
- * All numbers are doubles in the units of the model. Loading allocates all memory; nothing else does. A step takes no
- * lock and calls the operating system for the time alone. Two controllers are independent of each other; one
- * controller is for one thread at a time. No function throws or ends the process. */
+ * All numbers are doubles in the units of the model. Loading and difflcs_reserve allocate all memory; nothing else
+ * does. A step takes no lock and calls the operating system for the time alone. Two controllers are independent of each
+ * other; one controller is for one thread at a time. No function throws or ends the process. */
 #ifndef DIFFLCS_H
 #define DIFFLCS_H
 
@@ -78,6 +78,27 @@ typedef struct difflcs_plan {
   const double* mu;  /* (H + 1, n_c) multipliers of the constraints */
 } difflcs_plan;
 
+/* States to plan from at once, and the system and the bounds of each, linearised there: row-major, and the same at all
+ * stages. A pointer that is NULL stands for the controller's own numbers, for all states. */
+typedef struct difflcs_batch {
+  size_t count;                                /* states */
+  const double* x;                             /* (count, n_x); never NULL */
+  const double* goal;                          /* (n_goal) of all; NULL where n_goal is 0 */
+  const double *A, *B, *C, *d, *D, *E, *F, *c; /* (count, n_x, n_x), (count, n_x, n_u) and so on */
+  const double *u_min, *u_max;                 /* (count, n_u) */
+} difflcs_batch;
+
+/* Their plans; valid until the next call with this controller of difflcs_plan_many or difflcs_reserve. */
+typedef struct difflcs_plans {
+  const double* x;           /* (count, H + 1, n_x) states */
+  const double* u;           /* (count, H, n_u) actions */
+  const double* lam;         /* (count, H, n_lam) complementarity variables */
+  const double* mu;          /* (count, H + 1, n_c) multipliers of the constraints */
+  const double* objective;   /* (count) */
+  const double* residual;    /* (count) as in difflcs_outcome */
+  const signed char* status; /* (count) a difflcs_status each */
+} difflcs_plans;
+
 /* Loads a controller. Returns NULL where that fails, and writes why into `error`, if it is not NULL: at most `size`
  * bytes with the zero at the end. Files are checked in full (kind, version, size, checksum, every number). */
 DIFFLCS_API difflcs_controller* difflcs_load(const char* path, char* error, size_t size);
@@ -94,6 +115,15 @@ DIFFLCS_API difflcs_status difflcs_step(difflcs_controller* controller, const do
 /* The same along a reference (H + 1, n_goal): a goal for each state of the plan, the first for x. */
 DIFFLCS_API difflcs_status difflcs_follow(difflcs_controller* controller, const double* x, const double* reference,
                                           double* u);
+/* Plans from many states at once, as to compare places to push from. Each plan begins cold, with the starts that the
+ * backend of the file has for that; it neither uses nor changes the plan that difflcs_step follows. The time limit
+ * holds for the whole call. A plan that is not solved is finite and inside the bounds. Returns CONVERGED where all are
+ * solved, else the status of the first that is not; DIFFLCS_INVALID, having planned nothing, where a number is not
+ * finite, bounds cross, something is missing, or there is no memory for so many states: difflcs_reserve makes it. */
+DIFFLCS_API difflcs_status difflcs_plan_many(difflcs_controller* controller, const difflcs_batch* batch,
+                                             difflcs_plans* plans);
+/* Makes memory for up to `count` states at once. Returns DIFFLCS_INVALID where that fails. */
+DIFFLCS_API difflcs_status difflcs_reserve(difflcs_controller* controller, size_t count);
 /* Forgets all plans, as at the begin of an episode. */
 DIFFLCS_API void difflcs_reset(difflcs_controller* controller);
 
@@ -110,11 +140,11 @@ DIFFLCS_API void difflcs_set_time_limit(difflcs_controller* controller, double s
 DIFFLCS_API difflcs_status difflcs_set_fallback(difflcs_controller* controller, difflcs_fallback kind,
                                                 const double* action);
 
-/* Other numbers of the system, in the order A B C d D E F c, or of the cost, in the order Q R S Q_final q r q_final (Q, R
- * and Q_final symmetric): for a robot that linearises them anew before a step. Row-major, with the sizes of those in the
- * file, stages included, and copied; F + F^T must stay positive definite, and the cost convex. Returns DIFFLCS_INVALID,
- * and changes nothing, where one is NULL or not finite, or the cost has goals. Bounds of the actions likewise, each u_min
- * below its u_max. */
+/* Other numbers of the system, in the order A B C d D E F c, or of the cost, in the order Q R S Q_final q r q_final (Q,
+ * R and Q_final symmetric): for a robot that linearises them anew before a step. Row-major, with the sizes of those in
+ * the file, stages included, and copied; F + F^T must stay positive definite, and the cost convex. Returns
+ * DIFFLCS_INVALID, and changes nothing, where one is NULL or not finite, or the cost has goals. Bounds of the actions
+ * likewise, each u_min below its u_max. */
 DIFFLCS_API difflcs_status difflcs_set_system(difflcs_controller* controller, const double* const matrices[8]);
 DIFFLCS_API difflcs_status difflcs_set_cost(difflcs_controller* controller, const double* const terms[7]);
 DIFFLCS_API difflcs_status difflcs_set_bounds(difflcs_controller* controller, const double* u_min, const double* u_max);

@@ -1,4 +1,5 @@
 // The C interface, documented in difflcs.h. No exception leaves it.
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <exception>
@@ -29,6 +30,7 @@ static_assert(int(difflcs::Status::converged) == DIFFLCS_CONVERGED &&
 
 // Largest controller file [byte].
 constexpr long kLargestFile = 1L << 30;
+constexpr size_t kMostStates = 100000;
 
 void write_error(char* error, size_t size, const char* what) {
   if (error && size > 0) std::snprintf(error, size, "%s", what);
@@ -37,7 +39,7 @@ void write_error(char* error, size_t size, const char* what) {
 difflcs_status step(difflcs_controller* c, const double* x, const double* targets, bool follow, double* u) {
   if (!c || !x || !u || (!targets && c->controller.data().n_goal > 0) || (follow && c->controller.data().n_goal == 0))
     return DIFFLCS_INVALID;
-  return difflcs_status(int(c->controller.step(x, targets, follow, u).status));
+  return c->controller.step(x, targets, follow, u).status;
 }
 
 difflcs_status set_inputs(difflcs_controller* c, difflcs::Input first, int count, const double* const* values) {
@@ -98,8 +100,9 @@ void difflcs_free(difflcs_controller* c) { delete c; }
 difflcs_sizes difflcs_get_sizes(const difflcs_controller* c) {
   if (!c) return {};
   const difflcs::ControllerData& d = c->controller.data();
-  return {size_t(d.n_x),    size_t(d.n_u),     size_t(d.n_lam), size_t(d.n_c),
-          size_t(d.n_goal), size_t(d.horizon), d.step_seconds};
+  const difflcs::MpcBatch& b = d.batch;
+  return {size_t(b.n_x),    size_t(b.n_u),     size_t(b.n_lam), size_t(b.n_c),
+          size_t(d.n_goal), size_t(b.horizon), d.step_seconds};
 }
 
 difflcs_status difflcs_step(difflcs_controller* c, const double* x, const double* goal, double* u) {
@@ -115,15 +118,36 @@ void difflcs_reset(difflcs_controller* c) {
 }
 
 difflcs_outcome difflcs_get_outcome(const difflcs_controller* c) {
-  if (!c) return {DIFFLCS_INVALID, 0, 0, 0, 0, 0, 0};
-  const difflcs::Outcome& o = c->controller.outcome();
-  return {difflcs_status(int(o.status)), o.fallback, o.late, o.iterations, o.objective, o.residual, o.solve_seconds};
+  return c ? c->controller.outcome() : difflcs_outcome{DIFFLCS_INVALID, 0, 0, 0, 0, 0, 0};
 }
 
 difflcs_plan difflcs_get_plan(const difflcs_controller* c) {
   if (!c) return {};
   const difflcs::Trace& plan = c->controller.plan();
   return {plan.x.get(), plan.u.get(), plan.lam.get(), plan.mu.get()};
+}
+
+difflcs_status difflcs_reserve(difflcs_controller* c, size_t count) {
+  if (!c || count < 1 || count > kMostStates) return DIFFLCS_INVALID;
+  try {
+    c->controller.reserve(int64_t(count));
+    return DIFFLCS_CONVERGED;
+  } catch (...) {
+    return DIFFLCS_INVALID;
+  }
+}
+
+difflcs_status difflcs_plan_many(difflcs_controller* c, const difflcs_batch* b, difflcs_plans* plans) {
+  if (!c || !b || !plans || !b->x || (!b->goal && c->controller.data().n_goal > 0)) return DIFFLCS_INVALID;
+  const double* fields[difflcs::kInputs] = {b->A, b->B, b->C, b->d, b->D, b->E, b->F, b->c};
+  fields[difflcs::ku_min] = b->u_min;
+  fields[difflcs::ku_max] = b->u_max;
+  fields[difflcs::kx0] = b->x;
+  difflcs::MpcPlans found;
+  if (!c->controller.plan_many(int64_t(b->count), fields, b->goal, found)) return DIFFLCS_INVALID;
+  *plans = {found.x, found.u, found.lam, found.mu, found.objective, found.residual, found.status};
+  const int8_t* failed = std::find_if_not(found.status, found.status + b->count, difflcs::solved);
+  return failed == found.status + b->count ? DIFFLCS_CONVERGED : difflcs_status(int(*failed));
 }
 
 void difflcs_set_time_limit(difflcs_controller* c, double seconds) {
@@ -133,9 +157,9 @@ void difflcs_set_time_limit(difflcs_controller* c, double seconds) {
 difflcs_status difflcs_set_fallback(difflcs_controller* c, difflcs_fallback kind, const double* action) {
   if (!c || kind < DIFFLCS_HOLD || kind > DIFFLCS_UNFINISHED || (kind == DIFFLCS_GIVEN && !action))
     return DIFFLCS_INVALID;
-  for (int64_t j = 0; kind == DIFFLCS_GIVEN && j < c->controller.data().n_u; j++)
+  for (int64_t j = 0; kind == DIFFLCS_GIVEN && j < c->controller.data().batch.n_u; j++)
     if (!std::isfinite(action[j])) return DIFFLCS_INVALID;
-  c->controller.set_fallback(difflcs::Fallback(int(kind)), action);
+  c->controller.set_fallback(kind, action);
   return DIFFLCS_CONVERGED;
 }
 

@@ -82,10 +82,9 @@ constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::a
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
-// It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
-// kGain. Once one has, it ends after as many rounds in vain as there are starts: where the best plan of many starts can
-// be improved, there is more to find. Eight times as many rounds are the most. With fewer starts than kVaried there is
-// one, of three shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
+// It ends when kRounds in a row, or a quarter of the starts' number if that is more, have not made the cost smaller by
+// the part kGain; after eight times as many in any case. With fewer starts than kVaried there is one round, of three
+// shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
 constexpr double kGain = 1e-3;
 constexpr int64_t kFewVaried = 4, kSoftest = kVaried + 1;
 
@@ -124,20 +123,6 @@ double pulse(uint64_t seed, int64_t start, int64_t j, int64_t k, int64_t horizon
   if (double(k) < push) return first;
   return double(k) < brake ? -way * (kLeastPulse + (1.0 - kLeastPulse) * random(2)) : 0.0;
 }
-
-struct Sizes {
-  int64_t x, u, lam, mu;  // numbers of one plan
-  explicit Sizes(const MpcBatch& b)
-      : x((b.horizon + 1) * b.n_x), u(b.horizon * b.n_u), lam(b.horizon * b.n_lam), mu((b.horizon + 1) * b.n_c) {}
-};
-
-struct Bound {
-  double low, high;
-  Bound(const MpcBatch& b, int64_t element, int64_t i)
-      : low(b.at(ku_min, element, i / b.n_u)[i % b.n_u]), high(b.at(ku_max, element, i / b.n_u)[i % b.n_u]) {}
-  bool finite() const { return low > -kHuge && high < kHuge; }
-  double clip(double u) const { return std::min(std::max(u, low), high); }
-};
 
 void copy_plan(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& to, int64_t j) {
   std::copy_n(from.x + i * n.x, n.x, to.x + j * n.x);
@@ -594,10 +579,10 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
 void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                         int64_t first, int64_t count) {
   const Sizes n(batch);
+  idle.assign(count, 0);
   const bool few = effort.starts < kVaried;
-  const int64_t patience = std::max(kRounds, effort.starts);
+  const int64_t patience = std::max(kRounds, effort.starts / 4);
   const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * patience;
-  idle.assign(count, patience - std::max(kRounds, effort.starts / 4));
   const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
@@ -614,7 +599,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
-      vary(batch, effort, kind, round > 0 && idle[e] >= kRounds, out.u + e * n.u, j);
+      vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {

@@ -1,6 +1,7 @@
 // Search for the optimum of an LCS-MPC problem: its starts, their comparison, and the attempts if all fail. Shared by
 // the Python module and the C library, so that both give the same bits; independent of the instruction set.
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -22,6 +23,22 @@ struct MpcEffort {
 // The guess, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
 struct MpcGuess {
   const double *u, *lam, *mu;
+};
+
+// Numbers of one plan.
+struct Sizes {
+  int64_t x, u, lam, mu;
+  explicit Sizes(const MpcBatch& b)
+      : x((b.horizon + 1) * b.n_x), u(b.horizon * b.n_u), lam(b.horizon * b.n_lam), mu((b.horizon + 1) * b.n_c) {}
+};
+
+// Bounds of action number i of a plan (H, n_u).
+struct Bound {
+  double low, high;
+  Bound(const MpcBatch& b, int64_t element, int64_t i)
+      : low(b.at(ku_min, element, i / b.n_u)[i % b.n_u]), high(b.at(ku_max, element, i / b.n_u)[i % b.n_u]) {}
+  bool finite() const { return low > -kHuge && high < kHuge; }
+  double clip(double u) const { return std::min(std::max(u, low), high); }
 };
 
 // Runs work on one thread or on several, each with a separate workspace, until it is done or the time is over.
@@ -49,7 +66,6 @@ class MpcSearch {
   // Solves a batch.
   void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out, Runner& runner);
 
- private:
   // The plans of several problems, and how each began.
   struct Store {
     std::vector<double> x, u, lam, mu, objective, residual, gained;
@@ -62,6 +78,7 @@ class MpcSearch {
     int64_t count() const { return int64_t(element.size()); }
   };
 
+ private:
   void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const;
   void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const;
   void solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,

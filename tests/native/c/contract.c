@@ -1,6 +1,6 @@
-/* Checks of difflcs.h that need C: arguments that are null, no allocation after loading, two controllers at once, and a
- * controller under deadlines. With a second argument, a robot of changing numbers. Usage:
- * contract controller.difflcs [changes]; ends with 0 if all holds. */
+/* Checks of difflcs.h that need C: arguments that are null, no allocation after loading, two controllers at once, a
+ * controller under deadlines, and plans from many states at once. With a second argument, a robot of changing numbers.
+ * Usage: contract controller.difflcs [changes]; ends with 0 if all holds. */
 #include <difflcs.h>
 #include <math.h>
 #include <stdio.h>
@@ -52,7 +52,8 @@ static void null_pointers(const char* path) {
   difflcs_free(c);
 }
 
-/* A system that stays where it is, whatever is done: the best action is none. Matrices that do not fit change nothing. */
+/* A system that stays where it is, whatever is done: the best action is none. Matrices that do not fit change nothing.
+ */
 static void other_system(difflcs_controller* c, difflcs_sizes n) {
   static double zeros[64 * 64], eye_x[64 * 64], eye_lam[64 * 64], ones[64];
   const double* matrices[8] = {eye_x, zeros, zeros, zeros, zeros, zeros, eye_lam, ones};
@@ -69,6 +70,73 @@ static void other_system(difflcs_controller* c, difflcs_sizes n) {
   EXPECT(difflcs_set_system(c, matrices) == DIFFLCS_INVALID && difflcs_set_system(NULL, matrices) == DIFFLCS_INVALID);
   EXPECT(n.n_goal == 0 || difflcs_set_cost(c, matrices) == DIFFLCS_INVALID);
   EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_CONVERGED);
+}
+
+enum { MANY = 5 };
+
+/* Plans of a batch are those that each state gets alone, cold, with the system and the bounds of the batch. */
+static void same_alone(difflcs_controller* c, const difflcs_batch* batch, const difflcs_plans* plans, difflcs_sizes n) {
+  const size_t nx = n.n_x, nu = n.n_u, nl = n.n_lam, x = (n.horizon + 1) * nx, u = n.horizon * nu, lam = n.horizon * nl;
+  for (size_t i = 0; i < batch->count; i++) {
+    if (batch->A) {
+      const double* system[8] = {batch->A + i * nx * nx, batch->B + i * nx * nu, batch->C + i * nx * nl,
+                                 batch->d + i * nx,      batch->D + i * nl * nx, batch->E + i * nl * nu,
+                                 batch->F + i * nl * nl, batch->c + i * nl};
+      EXPECT(difflcs_set_system(c, system) == DIFFLCS_CONVERGED);
+      EXPECT(difflcs_set_bounds(c, batch->u_min + i * nu, batch->u_max + i * nu) == DIFFLCS_CONVERGED);
+    }
+    difflcs_reset(c);
+    EXPECT(difflcs_step(c, batch->x + i * nx, batch->goal, action) == (difflcs_status)plans->status[i]);
+    EXPECT(memcmp(difflcs_get_plan(c).x, plans->x + i * x, x * sizeof(double)) == 0);
+    EXPECT(memcmp(difflcs_get_plan(c).u, plans->u + i * u, u * sizeof(double)) == 0);
+    EXPECT(memcmp(difflcs_get_plan(c).lam, plans->lam + i * lam, lam * sizeof(double)) == 0);
+    EXPECT(difflcs_get_outcome(c).objective == plans->objective[i]);
+    EXPECT(difflcs_get_outcome(c).residual == plans->residual[i]);
+  }
+}
+
+static void many_at_once(difflcs_controller* c, difflcs_sizes n) {
+  static double x[MANY * 64], A[MANY * 64 * 64], some[MANY * 64 * 64], F[MANY * 64 * 64], low[MANY * 64],
+      high[MANY * 64];
+  difflcs_batch batch = {.count = MANY, .x = x, .goal = goal};
+  difflcs_plans plans;
+  for (size_t i = 0; i < MANY * n.n_x; i++) x[i] = 0.02 * sin(0.7 * (double)i);
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_INVALID); /* nothing is reserved */
+  EXPECT(difflcs_reserve(NULL, 1) == DIFFLCS_INVALID && difflcs_reserve(c, 0) == DIFFLCS_INVALID);
+  EXPECT(difflcs_reserve(c, (size_t)-1) == DIFFLCS_INVALID && difflcs_reserve(c, MANY) == DIFFLCS_CONVERGED);
+  const long before = allocations;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_CONVERGED);
+  same_alone(c, &batch, &plans, n);
+  batch.count = MANY - 2;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_CONVERGED);
+  same_alone(c, &batch, &plans, n);
+
+  difflcs_set_time_limit(c, 1e-9);
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_MAX_ITER);
+  for (size_t i = 0; i < batch.count * n.horizon * n.n_u; i++) EXPECT(isfinite(plans.u[i]));
+  difflcs_set_time_limit(c, 0);
+
+  /* A system and bounds of its own for each state. */
+  for (size_t i = 0; i < MANY * n.n_x * n.n_x; i++) A[i] = i % (n.n_x * n.n_x) % (n.n_x + 1) == 0;
+  for (size_t i = 0; i < MANY * n.n_lam * n.n_lam; i++) F[i] = i % (n.n_lam * n.n_lam) % (n.n_lam + 1) == 0;
+  for (size_t i = 0; i < MANY * 64 * 64; i++) some[i] = 0.3 * sin(1.3 * (double)i);
+  for (size_t i = 0; i < MANY * n.n_u; i++) low[i] = -0.01 - 0.001 * (double)(i % 3), high[i] = 0.01;
+  batch.A = A, batch.F = F, batch.u_min = low, batch.u_max = high;
+  batch.B = some, batch.C = some + 1, batch.d = x, batch.D = some + 2, batch.E = some + 3, batch.c = some + 4;
+  difflcs_plan_many(c, &batch, &plans);
+  same_alone(c, &batch, &plans, n);
+  EXPECT(allocations == before);
+
+  batch.u_min = high, batch.u_max = low;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_INVALID);
+  batch.u_min = batch.u_max = NULL, batch.count = MANY + 1;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_INVALID);
+  batch.count = MANY, F[0] = NAN;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_INVALID);
+  batch.F = batch.x = NULL;
+  EXPECT(difflcs_plan_many(c, &batch, &plans) == DIFFLCS_INVALID &&
+         difflcs_plan_many(c, NULL, &plans) == DIFFLCS_INVALID);
+  EXPECT(difflcs_plan_many(NULL, &batch, &plans) == DIFFLCS_INVALID);
 }
 
 /* A circle of all that one can ask of a loaded controller. */
@@ -134,8 +202,8 @@ static void independent(const char* path, difflcs_controller* first, difflcs_siz
 }
 
 /* A robot that linearises itself before each step. The file has for each of them the doubles of the system, of the
- * cost, of the bounds, of the state, and of the action of Python's controller. A step that is late takes the next action
- * of the last plan. */
+ * cost, of the bounds, of the state, and of the action of Python's controller. A step that is late takes the next
+ * action of the last plan. */
 static void changes(difflcs_controller* c, difflcs_sizes n, const char* path) {
   const size_t x = n.n_x, u = n.n_u, l = n.n_lam;
   const size_t counts[19] = {x * x, x * u, x * l, x, l * x, l * u, l * l, l, x * x, u * u,
@@ -191,6 +259,7 @@ int main(int argc, char** argv) {
   no_allocation(c, n);
   deadline_and_fallback(c, n);
   independent(argv[1], c, n);
+  many_at_once(c, n);
   difflcs_free(c);
   printf(failures ? "%d failures\n" : "all holds\n", failures);
   return failures != 0;
