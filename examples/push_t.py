@@ -1,5 +1,8 @@
 """Push-T (gym-pusht) by sampling-based contact MPC: `python examples/push_t.py --out push_t.gif` makes a film of it.
 
+`python examples/push_t.py --export DIR` writes what its program in C, `examples/c/push_t.c`, needs, and episodes to
+compare both.
+
 A disc of radius 15 px pushes a T, made of two boxes of 30 by 120 and 30 by 90 px, to a pose on a plane of 512 px. An
 action is the target of the disc's PD controller, for ten substeps of 0.01 s. The disc is kinematic: nothing pushes it
 back. Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is
@@ -11,10 +14,13 @@ With `--adapt` it finds the scale of the outline, friction and the stiffness of 
 
 from __future__ import annotations
 
+import csv
 import itertools
 import math
+import time
 import warnings
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +34,7 @@ from torch import Tensor
 
 from difflcs import Animation, GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
+from difflcs.mpc.export import export_controller
 from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.complementarity import Contacts
 from difflcs.physics.shapes import Shape
@@ -391,9 +398,114 @@ def _draw(draw: Any, decision: Decision, size: int) -> None:
         draw.line([tuple(point) for point in path], fill=BLUE, width=round(2 * line))
 
 
+def export(directory: Path) -> None:
+    """Write the policy for `examples/c/push_t.c`: its MPC as a controller, and numbers by their names.
+
+    Args:
+        directory: for `controller.difflcs`, `controller.json` and `push_t.txt`, made if needed.
+    """
+    policy = PushTPolicy()
+    system: Any = policy.system
+    sampling: Any = policy.sampling
+    mpc, places, travel, settings = sampling.mpc, sampling.places, sampling.travel, sampling.settings
+    still = system.params(torch.zeros(system.n_x, dtype=torch.float64))
+    step, course = travel.workspace.step, system.drive.course()
+    layer = LCSMPCLayer(still, mpc.cost, mpc.horizon, -step, step, relaxation=mpc.relaxation)
+    export_controller(layer, directory, step_seconds=0.1)
+    values = {
+        "pixels": PIXELS,
+        "goal": policy.goal,
+        "center": policy.center,
+        "outline": [part.corners.tolist() for part in system.shape.parts],
+        "center_of_mass": system.center_of_mass,
+        "gyration": system.gyration,
+        "compliance": system.compliance,
+        "radius": RADIUS,
+        "workspace": (policy.low, policy.high, step),
+        "weights": [0.5 * np.diag(constant) for constant in (mpc.cost.goal_stage, mpc.cost.goal_final)],
+        **{field.name: getattr(settings, field.name) for field in fields(settings)},
+        "reach": places.reach,
+        "margin": places.margin,
+        **{name: getattr(travel, name) for name in ("step", "clearance", "tolerance")},
+        "A": course.A,
+        "b": course.b,
+        "places": places.ring,
+        "waypoints": travel.ring,
+        "grid": travel.grid.axis[-1],
+    }
+    lines = (" ".join([name, *map(repr, np.ravel(value).tolist())]) for name, value in values.items())
+    (directory / "push_t.txt").write_text("\n".join(lines) + "\n")
+
+
+class Simulated:
+    """The policy's own system in place of the environment, for episodes of 25 steps; gym-pusht need not be there."""
+
+    def __init__(self) -> None:
+        self.system = tee_pushing()
+        self._x = torch.zeros(self.system.n_x, dtype=torch.float64)
+        self._left = 0
+
+    def reset(self, seed: int) -> tuple[list[float], dict[str, Any]]:
+        """Start an episode."""
+        place = np.random.default_rng(seed).uniform([1.5, 1.5, -3.0, 0.5, 0.5], [3.6, 3.6, 3.0, 4.6, 4.6])
+        self._x[:5], self._x[5:], self._left = torch.from_numpy(place), 0.0, 25
+        return self._observe(), {}
+
+    def step(self, action: Array) -> tuple[list[float], float, bool, bool, dict[str, Any]]:
+        """Move the disc to a target [px]."""
+        u = torch.from_numpy(action) / PIXELS - self._x[3:5]
+        self._x, self._left = self.system.params(self._x).step(self._x, u).x_next, self._left - 1
+        return self._observe(), 0.0, False, not self._left, {}
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def _observe(self) -> list[float]:
+        x, y, yaw, *disc = self._x[:5].tolist()
+        dx, dy, _ = from_origin([0.0, 0.0, yaw])
+        return [PIXELS * disc[0], PIXELS * disc[1], PIXELS * (x - dx), PIXELS * (y - dy), yaw]
+
+
+def record(directory: Path, seeds: Iterable[int], env: Any) -> float:
+    """Play episodes, and write what the policy saw and decided, as `examples/c/push_t.c` reads and prints it.
+
+    Args:
+        directory: for `observations.csv` and `actions.csv`.
+        seeds: of the episodes.
+        env: of `make_env`, or `Simulated`.
+
+    Returns:
+        CPU time of a step [ms], on average.
+    """
+    policy, seconds = PushTPolicy(), 0.0
+    seen, decided = [], []
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        policy.reset()
+        ended = False
+        while not ended:
+            began = time.process_time()
+            action = policy.act(observation)
+            seconds += time.process_time() - began
+            decision = policy.sampling.decision
+            assert decision is not None
+            seen.append((seed, *observation))
+            decided.append((str(decision.mode), decision.chosen, *action))
+            observation, _, success, truncated, _ = env.step(action)
+            ended = success or truncated
+    env.close()
+    for name, header, rows in (
+        ("observations.csv", ("episode", "disc x", "disc y", "x", "y", "angle"), seen),
+        ("actions.csv", ("mode", "place", "x", "y"), decided),
+    ):
+        with (directory / name).open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([header, *rows])
+    return 1e3 * seconds / len(seen)
+
+
 @dataclass
 class Options:
-    """A film of Push-T."""
+    """A film of Push-T, or its export."""
 
     out: Path = Path("push_t.gif")
     """Where the GIF goes."""
@@ -405,10 +517,21 @@ class Options:
     """Of the outline that the policy is told."""
     adapt: bool = False
     """Find scale, friction and drive while it runs, anew in each episode."""
+    export: Path | None = None
+    """Folder for the export to C, and the episodes, instead of a film."""
+    simulated: bool = False
+    """Export episodes of the policy's own system, without gym-pusht."""
 
 
 def main(o: Options) -> None:
-    """Play, and write the film at ten frames a second: real time."""
+    """Play, and write the film at ten frames a second: real time. Or export."""
+    if o.export is not None:
+        torch.set_num_threads(1)
+        export(o.export)
+        env = Simulated() if o.simulated else make_env()
+        milliseconds = record(o.export, range(o.seed, o.seed + o.episodes), env)
+        print(f"{o.episodes} episodes, {milliseconds:.2f} ms a step in Python")
+        return
     system = tee_pushing(shape=tee(o.scale))
     env, policy, frames = make_env(render_mode="rgb_array"), PushTPolicy(system, adapt=o.adapt), []
     for seed in range(o.seed, o.seed + o.episodes):

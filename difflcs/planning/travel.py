@@ -88,7 +88,7 @@ class PlanarTravel:
             self.n_x = f"{3 + 2 * order}+"  # see `takes`
             self._A = course.A.reshape(instants, -1, order, order).expand(-1, 2, -1, -1)  # by coordinate
             self._b = course.b.reshape(instants, -1, order).expand(-1, 2, -1)
-            self._grid = DistanceGrid(partial(clearance_of, shape), shape.radius + 2 * (radius + self.clearance))
+            self.grid = DistanceGrid(partial(clearance_of, shape), shape.radius + 2 * (radius + self.clearance))
             self.ring, x = ring(shape, radius + self.clearance, _WAYPOINTS), torch.zeros(3, dtype=torch.float64)
             seen = torch.stack([self._in_sight(x, point, self.ring) for point in self.ring])
             self._between = torch.where(seen & seen.mT, torch.cdist(self.ring, self.ring), math.inf)
@@ -223,7 +223,7 @@ class PlanarTravel:
 
     def _gap(self, x: Tensor, points: Tensor) -> Tensor:
         """Compute the gap (...) of a disc at points (..., 2) in coordinates of the body, which is as in the state x."""
-        gap, obstacles = self._grid.distance(points), self._in_the_way()
+        gap, obstacles = self.grid.distance(points), self._in_the_way()
         if obstacles is not None:
             gap = torch.minimum(gap, obstacles.gap(from_body(x, points)))
         return gap - self.radius

@@ -7,70 +7,14 @@
  * --bench, so many steps over the rows of the trajectory, again and again, are timed instead. On a robot the states
  * come from its sensors and the actions go to its motors; the rest stays as it is here. */
 #define _POSIX_C_SOURCE 199309L
+#include "common.h"
 #include <difflcs.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
 #include <time.h>
-
-enum { LONGEST_LINE = 1 << 16 };
 
 static double now(void) {
   struct timespec at;
   clock_gettime(CLOCK_MONOTONIC, &at);
   return (double)at.tv_sec + 1e-9 * (double)at.tv_nsec;
-}
-
-/* Reads all rows of `columns` numbers. Returns how many there are, or -1. */
-static long read_rows(const char* path, size_t columns, double** rows) {
-  static char line[LONGEST_LINE];
-  long count = 0;
-  size_t room = 0;
-  FILE* file = fopen(path, "r");
-  *rows = NULL;
-  if (!file) {
-    fprintf(stderr, "%s: expected a file that can be read\n", path);
-    return -1;
-  }
-  while (fgets(line, sizeof line, file)) {
-    char* at = line;
-    if (count > 0 && line[strspn(line, " \t\r\n")] == '\0') continue; /* an empty line, as at the end */
-    if (count++ == 0) continue;                                       /* the names */
-    if ((size_t)count > room) {
-      double* larger = realloc(*rows, (room = 2 * (size_t)count) * columns * sizeof(double));
-      if (!larger) break;
-      *rows = larger;
-    }
-    for (size_t i = 0; i < columns; i++) {
-      char* end;
-      (*rows)[(size_t)(count - 2) * columns + i] = strtod(at, &end);
-      if (end == at) {
-        fprintf(stderr, "%s: expected %zu numbers in row %ld, got %zu\n", path, columns, count - 1, i);
-        fclose(file);
-        return -1;
-      }
-      at = end + (*end == ',');
-    }
-    if (at[strspn(at, " \t\r\n")] != '\0') {
-      fprintf(stderr, "%s: expected %zu numbers in row %ld, got more\n", path, columns, count - 1);
-      fclose(file);
-      return -1;
-    }
-  }
-  fclose(file);
-  if (count < 2) fprintf(stderr, "%s: expected a line of names, and rows of %zu numbers\n", path, columns);
-  return count - 1;
-}
-
-static int ascending(const void* a, const void* b) {
-  const double x = *(const double*)a, y = *(const double*)b;
-  return (x > y) - (x < y);
-}
-
-static void report(const char* what, double* seconds, long count) {
-  qsort(seconds, (size_t)count, sizeof(double), ascending);
-  printf("%s [us]: p50 %.1f, p99 %.1f, largest %.1f\n", what, 1e6 * seconds[count / 2], 1e6 * seconds[count * 99 / 100],
-         1e6 * seconds[count - 1]);
 }
 
 /* The time of `steps` steps over the rows, and how many were not solved. */

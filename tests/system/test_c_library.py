@@ -170,6 +170,20 @@ def test_the_example_measures_itself(exported, robot):
 
 @pytest.mark.slow
 @needs_tools
+def test_push_t_in_c_decides_as_in_python(project, tmp_path):
+    files, program = [tmp_path, tmp_path / "observations.csv"], project("examples/c") / "push_t"
+    call(sys.executable, ROOT / "examples" / "push_t.py", "--export", tmp_path, "--simulated")
+    outputs = call(program, *files), (tmp_path / "actions.csv").read_text()
+    ours, theirs = ([line.split(",") for line in output.splitlines()] for output in outputs)
+    assert [row[:2] for row in ours] == [row[:2] for row in theirs]
+    targets = [np.array([row[2:] for row in rows[1:]], float) for rows in (ours, theirs)]
+    np.testing.assert_allclose(*targets, rtol=0, atol=1e-5)  # pixels
+    assert len({tuple(row[:2]) for row in ours}) > 8  # pushes, and travels to several places
+    assert call(program, *files, "--bench", 2).startswith("200 steps, baseline")
+
+
+@pytest.mark.slow
+@needs_tools
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="symbols are listed on Linux")
 def test_nothing_but_the_header_is_to_be_seen(installed):
     if shutil.which("nm") is None:
