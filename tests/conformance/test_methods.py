@@ -26,7 +26,7 @@ from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, stored_config, sum_seconds, train
 from difflcs.rl.tasks import register_task
 from tests.conformance.toy import STEPS, make_task
-from tests.conftest import refuse
+from tests.conftest import contents, refuse
 
 pytestmark = pytest.mark.usefixtures("registered")
 
@@ -241,8 +241,7 @@ def test_states_with_anything_wrong_are_refused_and_change_nothing(name, make_tr
         wrong += [({**tensors, key: other}, rest) for other in others]
         wrong.append(({path: kept for path, kept in tensors.items() if path != key}, rest))
     for parts in wrong:
-        with pytest.raises(CheckpointError):
-            trainer.load(unflatten(*parts))
+        refuse(CheckpointError, ".", trainer.load, unflatten(*parts))
     assert same(trainer.state_dict(), before)
 
 
@@ -252,12 +251,11 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     run.checkpoints.mkdir()
     state = load_checkpoint(finished(other).checkpoints)
     save_checkpoint(run.checkpoints, state["iteration"], state)
-    files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    files = contents(run.path)
     refuse(CheckpointError, "another method", train, make_config(name), run.path, resume=True)
     if make_config(other).method.kind != make_config(name).method.kind:
-        with pytest.raises(CheckpointError):
-            load_policy(run, TOY)
-    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == files
+        refuse(CheckpointError, ".", load_policy, run, TOY)
+    assert contents(run.path) == files
 
 
 def test_a_run_is_not_continued_with_another_configuration_or_environment(name, finished, tmp_path):
@@ -296,8 +294,7 @@ def test_only_what_learned_a_model_gives_one(name, finished):
         assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
     else:
         for path in (run.path, run.model):
-            with pytest.raises(CheckpointError):
-                load_model(path)
+            refuse(CheckpointError, ".", load_model, path)
 
 
 def test_what_was_learned_of_other_sizes_is_refused(name, finished):

@@ -331,7 +331,7 @@ def test_assets_download(capsys, tmp_path, monkeypatch):
 
 
 def test_an_existing_run_is_not_overwritten(capsys, finished):
-    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    before = contents(finished)
     code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", finished)
     assert code == 2
     assert "--resume" in err
@@ -343,7 +343,7 @@ def test_an_existing_run_is_not_overwritten(capsys, finished):
         assert (code, f"{str(words[0]).partition('=')[0].replace('_', '-')}: expected " in err) == (2, True)
     assert run(capsys, "train", "--out", finished, "--resume", "--seed", 0)[0] == 0
     assert run(capsys, "train", "--out", finished, "--resume")[0] == 0  # nothing left to do
-    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+    assert contents(finished) == before
 
 
 def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monkeypatch):

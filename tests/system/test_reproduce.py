@@ -45,6 +45,7 @@ from units import OBJECTS, Preset, Unit
 
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl import TrainConfig, TrainedPolicy, evaluate, get_method, get_task
+from tests.conftest import refuse
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
@@ -350,9 +351,8 @@ def test_only_what_is_missing_in_the_results_is_computed(tmp_path, capsys):
 def test_a_worker_that_would_compute_something_else_refuses(tmp_path):
     job = make_jobs([SCRATCH], tmp_path)[SCRATCH]
     other = replace(job, key="0123456789ab")  # as where other versions, settings or meshes are
-    with pytest.raises(InvalidInputError, match="install the same version of difflcs there") as caught:
-        worker.execute(other)
-    assert "set DIFFLCS_YCB_DIR" in str(caught.value)
+    message = refuse(InvalidInputError, "install the same version of difflcs there", worker.execute, other)
+    assert "set DIFFLCS_YCB_DIR" in message
     assert other.result() is None
 
 
@@ -569,18 +569,15 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     assert record["results"][0]["reached"].count("1") == nominal.successes
     assert (tmp_path / "robustness-smoke.png").is_file()
     assert not (tmp_path / "robustness.json").exists()
-    with pytest.raises(CheckpointError, match="pass another --results"):
-        robustness.draw_record(replace(options, goals=1))
+    refuse(CheckpointError, "pass another --results", robustness.draw_record, replace(options, goals=1))
     (tmp_path / "robustness.json").write_text(json.dumps(record))
     with pytest.raises(CheckpointError, match="expected a record of runs/mine, got one of zoo:trifinger-cube"):
         robustness.draw_record(replace(options, smoke=False, model=Path("runs/mine")))
     for text, message in ((json.dumps(record)[:-9], "expected JSON"), ("[]", "expected machine, options")):
         (tmp_path / "robustness.json").write_text(text)
-        with pytest.raises(CheckpointError, match=rf"robustness\.json: {message}"):
-            robustness.draw_record(replace(options, smoke=False))
+        refuse(CheckpointError, rf"robustness\.json: {message}", robustness.draw_record, replace(options, smoke=False))
     (tmp_path / "robustness.json").unlink()
-    with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
-        robustness.draw_record(replace(options, smoke=False))
+    refuse(CheckpointError, r"robustness\.py --rerun", robustness.draw_record, replace(options, smoke=False))
 
 
 # --- bad input --------------------------------------------------------------------------------------
@@ -623,8 +620,7 @@ def test_results_of_another_version_stay_as_they_are(content, results, capsys):
         code, _, err = run_script(main, capsys, *arguments, "--results", results, "--work", results / "work")
         assert code == 2
         assert "paper.csv: expected results with the columns task, method" in err
-    with pytest.raises(CheckpointError, match="Nothing was changed"):
-        records.add(results, "paper", unit_rows(unit, (1, 2, 3, 4)))
+    refuse(CheckpointError, "Nothing was changed", records.add, results, "paper", unit_rows(unit, (1, 2, 3, 4)))
     assert path.read_text() == content
     assert not (results / "table1.md").exists()
 

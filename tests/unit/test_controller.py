@@ -475,8 +475,7 @@ def test_every_cut_and_every_flipped_bit_is_found(saved):
         wrong.append(bytes(damaged))
     for damaged in wrong:
         saved.write_bytes(damaged)
-        with pytest.raises(CheckpointError):
-            MPCController.load(saved)
+        refuse(CheckpointError, ".", MPCController.load, saved)
 
 
 def test_what_is_no_controller(saved, tmp_path):

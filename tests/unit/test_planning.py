@@ -276,8 +276,7 @@ def test_bad_input_is_refused():
     policy = on_a_line()
     refuse(ShapeError, "x: expected", policy.act, [0.0, 0.0, 0.0], [1.0])
     refuse(ShapeError, "one robot", policy.act, [[0.0, 0.51]], [1.0])
-    with pytest.raises(NonFiniteError):
-        policy.act([math.nan, 0.51], [1.0])
+    refuse(NonFiniteError, "x: expected", policy.act, [math.nan, 0.51], [1.0])
     refuse(ShapeError, "goal", pushing()[1].act, [0.0, 0.0, 0.0, -0.61, 0.0], [1.0, 0.0])
     mpc = LCSMPCLayer(Line(), GoalCost.reach(2, 1), 4)
     refuse(InvalidInputError, "on_failure", SamplingPolicy, mpc, Sides(), Jump())
