@@ -4,6 +4,7 @@ import difflib
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ParamSpec, TypeGuard, TypeVar
@@ -349,6 +350,11 @@ def check_threads(value: int | None, name: str = "threads") -> None:
     """Check an optional number of threads or processes."""
     if value is not None:
         check_positive_int(name, value, maximum=MAX_THREADS)
+
+
+def usable_cpus() -> int:
+    """Count the CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:

@@ -82,9 +82,10 @@ constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::a
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
-// It ends when kRounds in a row, or a quarter of the starts' number if that is more, have not made the cost smaller by
-// the part kGain; after eight times as many in any case. With fewer starts than kVaried there is one round, of three
-// shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
+// It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
+// kGain. Once one has, it ends after as many rounds in vain as there are starts: where the best plan of many starts can
+// be improved, there is more to find. Eight times as many rounds are the most. With fewer starts than kVaried there is
+// one, of three shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
 constexpr double kGain = 1e-3;
 constexpr int64_t kFewVaried = 4, kSoftest = kVaried + 1;
 
@@ -579,10 +580,10 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
 void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                         int64_t first, int64_t count) {
   const Sizes n(batch);
-  idle.assign(count, 0);
   const bool few = effort.starts < kVaried;
-  const int64_t patience = std::max(kRounds, effort.starts / 4);
+  const int64_t patience = std::max(kRounds, effort.starts);
   const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * patience;
+  idle.assign(count, patience - std::max(kRounds, effort.starts / 4));
   const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
@@ -599,7 +600,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
-      vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
+      vary(batch, effort, kind, round > 0 && idle[e] >= kRounds, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {

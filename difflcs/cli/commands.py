@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 
 from difflcs import zoo
-from difflcs._checks import did_you_mean
+from difflcs._checks import did_you_mean, usable_cpus
 from difflcs._optional import require
 from difflcs.cli.flags import errors_by_flag
 from difflcs.cli.models import Evaluate, Export, Plot, Render
@@ -86,7 +86,6 @@ class Bench:
     def run(self) -> None:
         """Run the command."""
         from difflcs.cli import bench
-        from difflcs.mpc.backends.ipopt import usable_cpus
 
         threads = usable_cpus()
         sizes = (16, 2, 1) if self.smoke else (self.batch, self.ipopt_batch, self.repeats)

@@ -24,10 +24,10 @@ import torch
 
 import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, solve_lcp, zoo
+from difflcs._checks import usable_cpus
 from difflcs._optional import version
 from difflcs._storage import load_record, read_json
 from difflcs.errors import BackendNotFoundError, DiffLCSError
-from difflcs.mpc.backends.ipopt import usable_cpus
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
 """Groups of checks for users, in the order of the report."""

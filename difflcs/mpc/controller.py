@@ -247,10 +247,15 @@ class MPCController:
             x = self._update(x, goal, to_tensor(context), own)
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
-        u = np.empty(self.n_u)
-        self._status = status = self._native.step(x, targets, follow, u)
+        u = np.zeros(self.n_u)
+        if self._native is None:  # the first state has no numbers, so that no module was asked
+            self._status = status = int(Status.NUMERICAL)
+        else:
+            self._status = status = self._native.step(x, targets, follow, u)
         if update:
             self.time_limit = self._time_limit  # the modules have taken a part of it
+            if not np.isfinite(x).all():
+                u = self._within_bounds(u if self._action is None else self._action, own)
         if self._raises and not Status(status).solved:
             outcome = Status(status)
             raise SolveError(f"the step was not solved: {outcome.name} ({outcome.advice})", [0], [status])
@@ -271,7 +276,7 @@ class MPCController:
             np.zeros(self.n_goal) if self.n_goal else None if goal is None else _numbers("goal", goal, np.shape(goal))
         )
         finite = np.isfinite(x).all() and (goal is None or np.isfinite(goal).all())
-        if not finite and self._native is not None:
+        if not finite:
             return np.full(self.n_x, np.nan)  # the step fails and reports it
         call = Call(torch.from_numpy(x), None if goal is None else torch.from_numpy(goal), context=context)
         self._overridden = any(value is not None for value in overrides.values())
@@ -284,6 +289,16 @@ class MPCController:
             native: Any = self._native
             native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
         return x
+
+    def _within_bounds(self, u: NDArray[np.float64], overrides: dict[str, Any]) -> NDArray[np.float64]:
+        """Clip the action of a step without a state into the bounds of that step, as far as they are known."""
+        inputs = Inputs(self.horizon, sizes={"n_u": self.n_u})
+        setup: Any = self._setup
+        inputs.take_bounds(setup, Call(torch.empty(0), **overrides), setup.lcs, None)
+        low, high = (
+            inputs.tensors[name].detach().cpu().reshape(-1, self.n_u)[0].numpy() for name in ("u_min", "u_max")
+        )
+        return np.clip(u, low, high)
 
     def _set_inputs(self, setup: Setup, inputs: Inputs, overrides: dict[str, Any]) -> None:
         """Replace the numbers of the problem by others of the same shapes."""
@@ -338,8 +353,8 @@ class MPCController:
 
     @property
     def plan(self) -> ControllerPlan | None:
-        """Copy of the solver's last result, even if that step was not solved. None before the first step."""
-        if self._status is None:
+        """Copy of the solver's last result, even if that step was not solved. None before the first solve."""
+        if self._status is None or self._native is None:
             return None
         x, u, lam, mu = map(np.empty, self._shapes)
         self._native.plan(x, u, lam, mu)

@@ -167,15 +167,7 @@ def gather(setup: Setup, call: Call) -> Inputs:
     check_context(call.context, system, cost)
     inputs.add_system(system, call.x0, call.context, call.along)
     inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context, call.along)
-    bounds = setup.bounds
-    if call.bounds is not None:
-        bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
-    if bounds is None:
-        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, call.x0), strict=True))
-    else:
-        inputs.add_bounds(bounds)
-    inputs.replace_bound("u_min", call.u_min)
-    inputs.replace_bound("u_max", call.u_max)
+    inputs.take_bounds(setup, call, system, call.x0)
     inputs.add_constraints(setup.constraints if call.constraints is None else check_constraints(call.constraints))
     inputs.tensors["x0"] = call.x0
     return inputs
@@ -335,10 +327,23 @@ class Inputs:
         self.tensors.update(bounds.tensors())
         self.by_stage |= bounds.by_stage
 
+    def take_bounds(self, setup: Setup, call: Call, system: System, x0: Tensor | None) -> None:
+        """Take the bounds of a call, or else of a layer; without x0 those that depend on no state."""
+        bounds = setup.bounds
+        if call.bounds is not None:
+            bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
+        if bounds is None:
+            self.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, x0), strict=True))
+        else:
+            self.add_bounds(bounds)
+        self.replace_bound("u_min", call.u_min)
+        self.replace_bound("u_max", call.u_max)
+
     def replace_bound(self, name: str, value: Bound | None) -> None:
         """Replace a bound by that of this call, if there is one."""
         if value is not None:
-            self.tensors[name] = as_bound(name, value, [("n_u", self.sizes["n_u"])], self.tensors["Q"])
+            like = self.tensors.get("Q", self.tensors[name])
+            self.tensors[name] = as_bound(name, value, [("n_u", self.sizes["n_u"])], like)
             self.by_stage.discard(name)
 
     def add_constraints(self, constraints: Constraints | None) -> None:

@@ -374,12 +374,12 @@ def _rays(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
 def _normals_and_tangents(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
     """Compute the same of the directions n, t and −t of each contact, with a gap along n alone."""
     of: Any = torch if isinstance(mu, Tensor) else np
-    normal, (*batch, n, _, n_x) = contacts.normal[..., None, :], contacts.tangent.shape
-    both = of.stack([contacts.tangent, -contacts.tangent], -2).reshape(*batch, n, -1, n_x)
+    normal, (*batch, n, k, n_x) = contacts.normal[..., None, :], contacts.tangent.shape
+    both = of.stack([contacts.tangent, -contacts.tangent], -2).reshape(*batch, n, 2 * k, n_x)
     still = of.zeros_like(both)
     gap = of.concatenate([contacts.gap[..., None], still[..., 0]], -1)
-    rows, normals = (of.concatenate([normal, v], -2).reshape(*batch, -1, n_x) for v in (both, still))
-    return rows, normals, gap.reshape(*batch, -1)
+    rows, normals = (of.concatenate([normal, v], -2).reshape(*batch, n * (1 + 2 * k), n_x) for v in (both, still))
+    return rows, normals, gap.reshape(*batch, n * (1 + 2 * k))
 
 
 _LARGE_DRAG = 0.25

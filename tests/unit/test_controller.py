@@ -141,10 +141,12 @@ class Leaning(torch.nn.Module):
 
 def test_a_module_is_not_written_and_not_asked_at_a_state_that_is_none(build):
     mpc = LCSMPCLayer(Leaning(build.params(0)), build.cost(0), H, -0.3, 0.3)
-    controller, context = mpc.controller(), torch.ones(1).double()
-    controller.step(states(1)[0], context=context)
-    assert controller.step(np.full(4, np.nan), context=context).shape == (2,)
-    assert controller.status == Status.NUMERICAL
+    controller, context = mpc.controller(on_failure=[0.2, -0.9]), torch.ones(1).double()
+    for bounds in ({}, {"u_max": 0.1}, {"u_max": 0.05}, {}):
+        assert controller.step(NAN, context=context, **bounds).tolist() == [bounds.get("u_max", 0.2), -0.3]
+        assert controller.status == Status.NUMERICAL
+        if bounds:
+            controller.step(states(1)[0], context=context, **bounds)
     refuse(InvalidInputError, "may depend on the state", controller.save, "never.difflcs")
     refuse(InvalidInputError, "may depend on the state", export_controller, mpc, "never")
     assert not Path("never").exists()

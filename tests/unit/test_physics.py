@@ -273,6 +273,7 @@ def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):
     torch.testing.assert_close(found.normal, gaps)
     params = system.params(x)
     assert (params.n_x, params.n_u, params.n_lam) == (system.n_x, system.n_u, system.n_lam)
+    assert system.params(x[:0]).D.shape == (0, system.n_lam, system.n_x)
     # The gap of the system, without action and force, is the gap where the free motion leads.
     still = x.clone()
     still[:, 7:] = 0

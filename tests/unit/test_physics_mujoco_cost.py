@@ -121,9 +121,16 @@ def test_batches_of_states_and_goals_are_those_of_each():
     for i in np.ndindex(2, 3):
         own = cost.at((x + 0.1 * away)[i], goals[i]).tensors()
         for name in ("Q", "q", "Q_final", "q_final", "constant", "constant_stage"):
-            torch.testing.assert_close(found[name][i], own[name], rtol=1e-9, atol=1e-9)
+            assert torch.equal(found[name][i], own[name])  # whatever the others are
     assert cost.at(x, goals).q.shape == (2, 3, cost.n_x)
     assert cost.at(x, goals).Q.shape == (cost.n_x, cost.n_x)
+
+
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_no_states_have_no_plans(dynamic):
+    cost, x, module = make([Position("tip", goal=(0.1, 0.2, 0.3)), Effort()], dynamic)
+    layer = LCSMPCLayer(module, cost, 3, -1.0, 1.0, passes=2)
+    assert layer(x[: cost.n_x].expand(0, 2, -1)).u.shape == (0, 2, 3, 2)
 
 
 def test_weights_and_goals_get_gradients():

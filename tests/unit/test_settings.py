@@ -47,44 +47,32 @@ def test_bounds_that_are_reached(values):
     assert asdict(Inner(**values)).items() >= values.items()
 
 
-@pytest.mark.parametrize(
-    ("kind", "values"),
-    [
-        (Inner, {"count": 0}),
-        (Inner, {"count": 10}),
-        (Inner, {"share": 0.0}),
-        (Inner, {"share": 1.0}),
-        (Inner, {"share": math.nan}),
-        (Inner, {"share": math.inf}),
-        (Inner, {"count": 10**5000}),
-        (Outer, {"pair": (0.5, 1.0)}),
-        (Outer, {"pair": (-0.1, 0.5)}),
-        (Outer, {"many": (1, 0)}),
-        (Outer, {"maybe": 0}),
-        (Outer, {"size": 2**63}),
-    ],
-)
-def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
-    name = next(iter(values))
-    refuse(InvalidInputError, rf"{name}: expected a finite .*{name}", kind, **values)
+OUTSIDE = {  # numbers outside their bounds
+    (Inner, "count"): (0, 10, 10**5000),
+    (Inner, "share"): (0.0, 1.0, math.nan, math.inf),
+    (Outer, "pair"): ((0.5, 1.0), (-0.1, 0.5)),
+    (Outer, "many"): ((1, 0),),
+    (Outer, "maybe"): (0,),
+    (Outer, "size"): (2**63,),
+}
+OTHERS = {  # values of another type
+    (Outer, "inner"): (3, {"count": 3}),
+    (Outer, "pair"): ((0.1,), (0.1, 0.2, 0.3), 0.1, ("a", "b")),
+    (Outer, "many"): ((1.5,),),
+    (Outer, "maybe"): (1.5, True),
+    (Outer, "kind"): ("c", None),
+    (Outer, "flag"): (1,),
+    (Outer, "text"): (1,),
+    (Outer, "size"): (1.0, True, "1"),
+}
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"inner": 3},
-        {"inner": {"count": 3}},
-        *({"pair": wrong} for wrong in [(0.1,), (0.1, 0.2, 0.3), 0.1, ("a", "b")]),
-        {"many": (1.5,)},
-        *({"maybe": wrong} for wrong in [1.5, True]),
-        *({"kind": wrong} for wrong in ["c", None]),
-        {"flag": 1},
-        {"text": 1},
-        *({"size": wrong} for wrong in [1.0, True, "1"]),
-    ],
-)
-def test_values_of_another_type_are_refused_by_name(values):
-    refuse(DTypeError, next(iter(values)), Outer, **values)
+@pytest.mark.parametrize(("kind", "name"), dict.fromkeys([*OUTSIDE, *OTHERS]))
+def test_values_that_do_not_fit_are_refused_by_name(kind, name):
+    for value in OUTSIDE.get((kind, name), ()):
+        refuse(InvalidInputError, rf"{name}: expected a finite .*{name}", kind, **{name: value})
+    for value in OTHERS.get((kind, name), ()):
+        refuse(DTypeError, name, kind, **{name: value})
 
 
 def test_integers_stand_for_floats_and_none_where_it_is_declared():

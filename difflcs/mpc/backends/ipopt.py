@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from difflcs._checks import check_number, check_positive_int, check_threads, make_plain
+from difflcs._checks import check_number, check_positive_int, check_threads, make_plain, usable_cpus
 from difflcs.mpc import conditions, kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
@@ -335,11 +335,6 @@ class _Pool:
     def _replace(self, slot: int) -> None:
         self.workers[slot].close()
         self.workers[slot] = _Worker()
-
-
-def usable_cpus() -> int:
-    """Count the CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_pids() -> tuple[int, ...]:

@@ -77,7 +77,7 @@ class WholeStep:
         found, states = [x.detach()], state.flatten(x, np.zeros(0))
         to = state.nq, state.nq + state.nv
         for action in u.detach().unbind(-2)[:-1]:
-            ctrl = control(found[-1], action).double().cpu().reshape(len(states), -1).contiguous().numpy()
+            ctrl = control(found[-1], action).double().cpu().reshape(len(states), self.model.nu).contiguous().numpy()
             after = self.simulate(places, states, ctrl)
             if not np.isfinite(after).all():
                 return None
@@ -85,7 +85,7 @@ class WholeStep:
                 mujoco.mj_integratePos(self.model, one[: to[0]], change[: state.nv], 1.0)
             states[:, to[0] : to[1]] = after[:, state.nv : 2 * state.nv]
             states[:, to[1] :] += after[:, 2 * state.nv :]
-            found.append(state.to_state(*np.split(states.reshape(*x.shape[:-1], -1), to, -1)).to(x))
+            found.append(state.to_state(*np.split(states.reshape(*x.shape[:-1], states.shape[1]), to, -1)).to(x))
         return torch.stack(found, -2)
 
 

@@ -210,7 +210,7 @@ class MujocoCost(TensorFields):
         Q = A[..., None, :, :].swapaxes(-1, -2) @ weighted
         q = (left[..., None, None, :] @ weighted)[..., 0, :]
         constant = (weight * left[..., None, :] ** 2).sum(-1)
-        Q = Q + (_ROUNDING * abs(Q).max()) * of.eye(self.n_x)
+        Q = Q + _ROUNDING * of.amax(abs(Q), (-3, -2, -1), keepdims=True) * of.eye(self.n_x)
         fields = {"Q": Q[..., 0, :, :], "R": 2 * of.diag(effort), "Q_final": Q[..., 1, :, :], "q": q[..., 0, :]}
         fields |= {"r": of.zeros(self.n_u), "q_final": q[..., 1, :]}
         fields |= {"constant": constant[..., 1], "constant_stage": constant[..., 0]}

@@ -322,7 +322,7 @@ class MujocoLCS:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
-        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
+        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
         moved = self._read_motion(states, ctrl)

@@ -59,7 +59,7 @@ class Nominal(NamedTuple):
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
         slid = np.zeros_like(self.rows.bound)
-        return np.concatenate([forces.reshape(len(forces), -1), smooth, self.row_forces, slid], -1)
+        return np.concatenate([forces.reshape(len(forces), each * forces.shape[1]), smooth, self.row_forces, slid], -1)
 
 
 class Recovery:
@@ -148,7 +148,7 @@ class _Rays:
         n, k = rays.shape[:2]
         self.shape = n, k, max(1, 2 * slide.shape[2])
         self._kept = np.flatnonzero(rough[:, None] | (np.arange(self.shape[2]) == 0))  # one where all are the same
-        self._rows = np.concatenate([rays.reshape(n, -1, rays.shape[-1])[:, self._kept], rows.normal], 1)
+        self._rows = np.concatenate([rays.reshape(n, k * self.shape[2], rays.shape[-1])[:, self._kept], rows.normal], 1)
         self._response, self._give, self._compliance, self._of_rows = response / give, give, compliance, rows.gap
         unbounded = np.full((n, self._rows.shape[1] - rows.bound.shape[1]), np.inf)
         self._low = np.concatenate([np.zeros_like(unbounded), -give * rows.bound], 1)
