@@ -83,7 +83,7 @@ def test_the_policy_plans_with_what_the_description_says():
 
 def test_a_task_without_physics_is_refused_and_its_place_stays_free(tmp_path):
     task, config = make_task(physics=None), rl.TrainConfig(task="toy", method=ContactMethod())
-    refuse(InvalidInputError, "known physics for contact-lcs, got toy without", rl.train, config, tmp_path, task=task)
+    refuse(InvalidInputError, "known physics, got toy without", rl.train, config, tmp_path, task=task)
     rl.RunDirectory.check_free(tmp_path)
 
 

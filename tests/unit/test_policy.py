@@ -55,6 +55,12 @@ def test_a_layer_is_a_tensordict_module(mpc):
     assert module.get_parameter("module.lcs.A").grad.abs().sum() > 0
 
 
+def test_observations_in_single_precision_give_actions_in_it(mpc):
+    data = LCSMPCPolicy(mpc, STD)(observations(3).float())
+    assert data["action"].dtype == data["action_log_prob"].dtype == torch.float32
+    torch.testing.assert_close(data["loc"].double(), mpc(*observations(3).values()).action, rtol=0, atol=1e-6)
+
+
 def test_deterministic_mode_is_the_mean(mpc):
     policy = LCSMPCPolicy(mpc, STD)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

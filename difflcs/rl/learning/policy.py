@@ -60,9 +60,9 @@ class GaussianParameters(TensorDictModuleBase):
         self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=covariance == "full")
 
     def write(self, tensordict: TensorDictBase, mean: Tensor) -> TensorDictBase:
-        """Write the Gaussian of mean (..., n_u)."""
+        """Write the Gaussian of mean (..., n_u), in its dtype."""
         tensordict["loc"] = mean
-        tensordict["scale_tril"] = self.scale_tril().expand(*tensordict.batch_size, -1, -1)
+        tensordict["scale_tril"] = self.scale_tril().to(mean.dtype).expand(*tensordict.batch_size, -1, -1)
         return tensordict
 
     def scale_tril(self) -> Tensor:

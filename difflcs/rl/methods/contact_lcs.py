@@ -104,7 +104,7 @@ def known_physics(task: TaskSpec) -> PhysicsSpec:
     """
     if task.physics is None:
         raise InvalidInputError(
-            f"method: expected a task with known physics for {ContactMethod.name}, got {task.name} without; give its "
-            f"TaskSpec a PhysicsSpec, or learn it by lcs-rl"
+            f"method: expected a task with known physics, got {task.name} without; give its TaskSpec a PhysicsSpec, "
+            f"or learn it by lcs-rl"
         )
     return task.physics
