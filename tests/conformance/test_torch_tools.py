@@ -76,6 +76,7 @@ TOOLS = {
     "old weight_norm": of_each(utils.weight_norm),
     "old spectral_norm": of_each(utils.spectral_norm),
     "averaged": averaged,
+    "hooks of gradients": of_each(lambda lcs, name: getattr(lcs, name).register_hook(lambda grad: grad / 2)),
 }
 
 

@@ -262,7 +262,8 @@ class LCSMPCPolicy(GaussianPolicy):
             InvalidInputError, DTypeError: the LCS has none, or is no `torch.nn.Module`.
         """
         lcs = check_module(self.mpc.lcs, name="actor")
-        if not (is_plain(lcs) or getattr(lcs, "batched", False)):
+        hooked = any(p._backward_hooks for p in lcs.parameters())  # such as a mask of gradients, which copies have not
+        if hooked or not (is_plain(lcs) or getattr(lcs, "batched", False)):
             state, goal = _entries(data, self.in_keys)
             with ignore_solver_warnings():
                 jacobian = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
