@@ -183,3 +183,29 @@ def test_fast_and_unstable_robots_have_a_system_at_every_state(seconds):
     assert float(upright.params(torch.zeros(4).double()).F.min()) > 0
     mpc = LCSMPCLayer(module, GoalCost.reach(4, 2, (1.0, 1.0), input_weight=0.1), 5, -1.0, 1.0, on_failure="mask")
     assert mpc(x[:8], torch.zeros(8, 2).double()).status[0] == Status.CONVERGED
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize(("shape", "depth"), [("box", 0.001), ("sphere", 2e-4)])
+@pytest.mark.parametrize("speed", [0.0, 0.05])
+def test_what_is_pressed_across_its_rail_has_friction(shape, depth, cone, speed):
+    bodies = f"""<body><joint name="rail" type="slide" axis="1 0 0"/><geom type="box" size=".1 .1 .05" mass="1"/></body>
+      <geom type="{shape}" size=".05 .05 .05" pos="0 {0.15 - depth} 0"/>
+      <body pos="1 0 0"><joint type="slide" axis="1 0 0"/><geom size=".1"/></body>"""
+    option = f'<option timestep=".002" cone="{cone}" gravity="0 0 0"/><default><geom friction=".5"/></default>'
+    model = load(bodies, '<actuator><position joint="rail" kp="100" kv="5"/></actuator>', option)
+    for ctrl in (0.05, -0.1):
+        data = mujoco.MjData(model)
+        data.qvel[0] = speed
+        module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
+        x = module.observe(data)
+        found = float(module.params(x).step(x, torch.tensor([ctrl]).double()).x_next[model.nv])
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, 10)
+        assert abs(found - data.qvel[0]) < 0.12 * 1.9 * abs(ctrl)  # of the speed that it gets without friction
+    # What can only rub is no contact where positions are the state, or where MuJoCo has none.
+    assert (module.contacts(x).gap < 0).any()
+    positions = MujocoLCS(model, data, motion="quasi-static"), MujocoLCS(model, data, motion="quasi-dynamic")
+    model.geom_contype[:] = 0
+    for other in (*positions, MujocoLCS(model, data, motion="dynamic", pairs=[(0, 1)])):
+        assert (other.contacts(torch.zeros(other.n_x, dtype=torch.float64)).gap >= 0).all()

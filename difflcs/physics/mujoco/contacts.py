@@ -103,10 +103,12 @@ class ContactFinder:
         friction: coefficient of all; None: that of the geoms.
         torsion: False to leave out torsional friction.
         expected: True to warn if nothing may touch; so are named pairs, and a number of contacts.
+        presses: True to find contacts that overlap and can only rub, see `overlap.py`; not in a plane of motion.
 
     Attributes:
         axis: normal (3,) of the plane in which everything moves, or None.
         pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
+        main_pairs: those of the first budget.
         n_contacts: number of contacts of every state.
         n_tangents: of each contact; the third, where there is torsional friction, is the spin about the normal times
             the radius at which sliding friction would hold it back as much.
@@ -125,6 +127,7 @@ class ContactFinder:
         friction: float | None,
         torsion: bool,
         expected: bool,
+        presses: bool,
     ):
         self.model, self.data, self.distance = model, data, distance
         self._warn_within = _NEAR * length if contacts is None else -np.inf
@@ -132,6 +135,7 @@ class ContactFinder:
         self.friction = _coefficients(model, 0) if friction is None else np.full((model.ngeom, model.ngeom), friction)
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
+        self._rubs = _may_touch(model) & (self.friction > 0) & (presses and self.axis is None)
         _check_contacts(model, self.allowed, friction)
         self._margin = _margins(model) * self.allowed
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
@@ -146,6 +150,7 @@ class ContactFinder:
         if contacts is None:
             contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))
         budgets = [Budget(self.allowed, contacts, distance)] if isinstance(contacts, int) else list(contacts)
+        self.main_pairs = [side[budgets[0].pairs[first, second]] for side in self.pairs]
         self.n_contacts = sum(budget.contacts for budget in budgets)
         self.n_tangents = (1 if self.axis is not None else 2) if (self.friction[first, second] > 0).any() else 0
         self._spin = _coefficients(model, 1) / np.where(self.friction > 0, self.friction, np.inf)
@@ -192,6 +197,7 @@ class ContactFinder:
         number[solids] = np.arange(len(solids))
         size = np.minimum(model.geom_rbound[first], model.geom_rbound[second])
         rough = np.repeat([budget.friction for budget in budgets], [len(mine) for mine in of])
+        rubs = np.where(self._rubs[first, second] & rough, self._margin[first, second], -np.inf)
         fields = {
             "nq": model.nq,
             "nv": model.nv,
@@ -207,7 +213,7 @@ class ContactFinder:
             "solids": [describe_solid(model, int(geom)) for geom in solids],
             "geoms": np.stack([first, second], -1).astype(np.int64),
             "flags": np.stack([formula, boxes, meet], -1),
-            "numbers": np.stack([size, self.friction[first, second] * rough, self._spin[first, second]], -1),
+            "numbers": np.stack([size, self.friction[first, second] * rough, self._spin[first, second], rubs], -1),
             "groups": groups,
         }
         return _mujoco.Scene(fields)

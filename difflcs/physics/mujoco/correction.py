@@ -90,7 +90,7 @@ class WholeStep:
 
 
 def correct(
-    system: LCSParams, step: DynamicStep, after: Array, tangent: Array | None, bound: Array, rows: Rows
+    system: LCSParams, step: DynamicStep, after: Array, tangent: Array | None, bound: Array, rows: Rows, hard: Any
 ) -> tuple[LCSParams, NDArray[np.bool_]]:
     """Correct C and d of systems at n states; return them, and those (n,) where more is corrected than moves.
 
@@ -101,6 +101,7 @@ def correct(
         tangent: of the states' rotations, see `MujocoState.tangent`.
         bound: (n, n_bounded) of dry friction, the last forces of the systems.
         rows: limits and dry friction.
+        hard: (n, k) False for the forces of soft contacts, among the first k.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
     found = advance(system, *(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
@@ -114,7 +115,7 @@ def correct(
     known = np.isfinite(change).all(1, keepdims=True)
     change = np.where(known, change, 0.0)
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
-    trees, tree = np.unique(step.tree, return_inverse=True)
+    trees, tree = np.unique(step.motion.tree, return_inverse=True)
     mass = (tree[:, None] == np.arange(len(trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
 
     def size(moved: NDArray[Any]) -> Array:
@@ -122,6 +123,7 @@ def correct(
         return np.sqrt((moved[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0])
 
     energy = mass.swapaxes(-1, -2) @ (C[:, nv : 2 * nv] * forces[:, None]) ** 2
+    energy[:, :, : hard.shape[1]] *= hard[:, None]  # soft contacts press all the time, whatever moves
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs.physics.complementarity import FreeMotion
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
 from difflcs.physics.mujoco.native import copy_taken, flags, native
 
 Array = NDArray[np.float64]
@@ -91,10 +90,6 @@ class Equality:
                 rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, 1], firm)])
         gap, normal, damping, regularisation = map(np.stack, zip(*rows, strict=True))
         return EqualityRows(gap, normal, damping, normal.swapaxes(-1, -2) / regularisation[:, None])
-
-    def hold(self, motion: Dynamic, read: Linearised, x: Array, qpos: Array) -> DynamicStep:
-        """Return the step with the constraints from states x (n, n_x), which have positions qpos (n, nq)."""
-        return motion.finish(read, x, self.read(qpos, read.middle[:, : motion.model.nv]))
 
     def hold_positions(self, free: FreeMotion, x: Array, qpos: Array, tangent: Array | None) -> FreeMotion:
         """Return a motion of positions x (n, nv), which are qpos (n, nq), that keeps to the constraints."""

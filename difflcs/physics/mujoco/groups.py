@@ -31,47 +31,37 @@ class ContactGroup(NamedTuple):
     distance: float | None = None
 
 
-class ContactSelection:
-    """Selects the pairs of geoms of each group.
+def find_budgets(
+    model: Any, contacts: int | Sequence[ContactGroup] | None, distance: float
+) -> int | list[Budget] | None:
+    """Return the budgets of groups for a `ContactFinder`, or the number of contacts that is given in place of groups.
 
     Args:
         model: the MuJoCo model.
-        groups: the groups; a pair of geoms belongs to the first that has one of the two.
+        contacts: the groups; a pair of geoms belongs to the first that has one of the two.
         distance: of the module [m].
-
-    Attributes:
-        budgets: the same for a `ContactFinder`.
-        group: (ngeom, ngeom) number of the group of each pair; −1 for none.
     """
-
-    def __init__(self, model: Any, groups: Sequence[ContactGroup], distance: float):
-        if not groups or not all(isinstance(group, ContactGroup) for group in groups):
-            raise InvalidInputError(
-                f"contacts: expected a number, or a list of ContactGroup, got {describe(groups)}; give one at least"
-            )
-        self.group = np.full((model.ngeom, model.ngeom), -1)
-        for i, group in enumerate(groups):
-            of = [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of
-            for one in check_list("of of a group", of, "name geoms or bodies"):
-                mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-                sides = check_pair("of of a group", one) if isinstance(one, tuple) else (one, None)
-                geoms = (range(model.ngeom) if side is None else find_geoms(model, side) for side in sides)
-                mine[np.ix_(*geoms)] = True
-                self.group[(mine | mine.T) & (self.group < 0)] = i
-        self.budgets = [
-            Budget(
-                self.group == i,
-                check_positive_int("contacts of a group", group.contacts),
-                distance
-                if group.distance is None
-                else check_number("distance of a group", group.distance, strict=True),
-                check_kind("friction of a group", group.friction, bool, "give True or False"),
-            )
-            for i, group in enumerate(groups)
-        ]
-
-    def main(self, pairs: Sequence[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the pairs, of two arrays of geoms, that belong to the first group."""
-        first, second = pairs
-        mine = self.group[first, second] == 0
-        return first[mine], second[mine]
+    if not isinstance(contacts, Sequence):
+        return None if contacts is None else check_positive_int("contacts", contacts)
+    if not contacts or not all(isinstance(group, ContactGroup) for group in contacts):
+        raise InvalidInputError(
+            f"contacts: expected a number, or a list of ContactGroup, got {describe(contacts)}; give one at least"
+        )
+    number = np.full((model.ngeom, model.ngeom), -1)  # of the group of each pair
+    for i, group in enumerate(contacts):
+        of = [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of
+        for one in check_list("of of a group", of, "name geoms or bodies"):
+            mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+            sides = check_pair("of of a group", one) if isinstance(one, tuple) else (one, None)
+            geoms = (range(model.ngeom) if side is None else find_geoms(model, side) for side in sides)
+            mine[np.ix_(*geoms)] = True
+            number[(mine | mine.T) & (number < 0)] = i
+    return [
+        Budget(
+            number == i,
+            check_positive_int("contacts of a group", group.contacts),
+            distance if group.distance is None else check_number("distance of a group", group.distance, strict=True),
+            check_kind("friction of a group", group.friction, bool, "give True or False"),
+        )
+        for i, group in enumerate(contacts)
+    ]

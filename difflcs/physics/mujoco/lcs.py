@@ -17,11 +17,9 @@ from difflcs._checks import (
     check_choice,
     check_kind,
     check_number,
-    check_positive_int,
     check_tensor,
     takes_arrays,
 )
-from difflcs.errors import InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
     Bounded,
     Cone,
@@ -36,12 +34,13 @@ from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, median_apart, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
-from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
+from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
-from difflcs.physics.mujoco.native import TAKEN, check_readable, flags, native, taken
-from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
+from difflcs.physics.mujoco.native import check_readable, flags, native, take_given, taken
+from difflcs.physics.mujoco.nominal import Recovery, Situation
+from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
@@ -140,7 +139,7 @@ class MujocoLCS:
         model.opt.disableflags |= flags("AUTORESET")  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
         if data is not None:
-            _take(self._data, data)
+            take_given(self._data, data)
         self._given = disabled, taken(self._data), options
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
@@ -162,17 +161,17 @@ class MujocoLCS:
         length = typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = ContactSelection(model, contacts, distance) if isinstance(contacts, Sequence) else None
-        budgets: Any = self._selection.budgets if self._selection else contacts
-        budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
+        budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
-        self._finder = ContactFinder(model, self._data, self._places, pairs, *more)
+        self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
+        self._touching = copy.copy(model)
+        self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
-            self._give = self._typical_response()
+            self._give, self._yields = _respond(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is built again, as what is compiled holds addresses."""
@@ -212,7 +211,7 @@ class MujocoLCS:
             DTypeError, ShapeError, NonFiniteError: no such data.
         """
         check_kind("data", data, mujoco.MjData, "for arrays use state.follow")
-        _take(self._data, data)
+        take_given(self._data, data)
         self.state.follow(data.qpos)
         return self.state.to_state(data.qpos, data.qvel, data.act)
 
@@ -227,12 +226,15 @@ class MujocoLCS:
             InvalidInputError and its kinds: no state, or of another size.
         """
         read = self._read(x := given_states(x), context)
-        contacts, rest, step, rough = read.dof_contacts, None, None, self._finder.rough
+        contacts, rough, rest, step, overlaps = read.dof_contacts, self._finder.rough, None, None, None
         if isinstance(self._motion, Dynamic):
-            step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
-            found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
+            middle = read.moved.middle[:, : self.state.nv]
+            step = self._motion.finish(read.moved, read.x, self._equality.read(read.qpos, middle))
+            found = self._rows.find(read.qpos, step.place, step.response, middle)
             soft = self._recovery, self._give, self.compliance, self.cone == "anitescu"
-            nominal = evaluate_nominal(Situation(step, contacts, rough, found, *soft))
+            at = Situation(step, contacts, rough, found, *soft)
+            overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
+            nominal = overlaps.evaluate(at)
             contacts, rows = nominal.contacts, nominal.rows
             rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone))
             free = step.free(read.tangent, nominal.carried)
@@ -245,13 +247,14 @@ class MujocoLCS:
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
             contacts = contacts.take(rough)
+        soft = np.full_like(contacts.gap, self.compliance) if overlaps is None else overlaps.compliance[:, rough]
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         matrices = assemble_lcs(
             read.contacts(contacts),
             FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in zip(free, (2, 2, 1, 2), strict=True))),
             read.batched(read.x),
             read.batched(contacts.friction),
-            read.batched(soften(rows, found, step, self._give, self.compliance, contacts.gap.shape[1])),
+            read.batched(soften(rows, found, step, self._give, self.compliance, soft)),
             self.cone,
             self.length,
             self.length / self._give,
@@ -259,11 +262,12 @@ class MujocoLCS:
             **read.constraints(rows, effect),
         )
         system = LCSParams.of_fitting(matrices)
-        if step is not None and self._whole is not None and self.n_lam:
+        if step is not None and overlaps is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
             after = self._whole.simulate(self._places, read.states, idle)
-            rubs = rows.bound * self._give / self.length
-            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found)
+            rubs, each = rows.bound * self._give / self.length, count_forces(1, self._finder.n_tangents, self.cone)
+            hard = np.repeat(~overlaps.soft[:, rough], each, 1)
+            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found, hard)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
@@ -336,22 +340,6 @@ class MujocoLCS:
             return self._motion.read(self._places, states, ctrl)
         return read_each(self._motion, self._model, self._data, states, ctrl)
 
-    def _typical_response(self) -> float:
-        """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
-        model, data, nv = self._model, self._data, self.state.nv
-        here = np.concatenate([data.qpos, data.qvel, data.act])[None]
-        moved = self._read_motion(here, self._ctrl[None])
-        x = np.zeros((1, self.n_x))
-        if not isinstance(self._motion, Dynamic):
-            response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
-            self._yields = self._actuators.yields(response, 0.0)
-        else:
-            impulse = self._motion.finish(moved, x).response[0]
-            response = self.seconds * impulse
-            self._yields = self._actuators.yields(self.seconds * response, response)
-        pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        return median_apart(model, data, here[0], response, pairs, 3 if self._finder.axis is None else 2)
-
 
 class _States(NamedTuple):
     """Contacts and motion that were read at n states.
@@ -409,6 +397,23 @@ class _States(NamedTuple):
         if still := self.x.shape[-1] - rows.shape[-1]:
             rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1)
         return self.batched(rows)
+
+
+def _respond(of: MujocoLCS) -> tuple[float, Any]:
+    """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
+    model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
+    here = np.concatenate([data.qpos, data.qvel, data.act])[None]
+    moved = of._read_motion(here, of._ctrl[None])
+    x = np.zeros((1, of.n_x))
+    if not isinstance(of._motion, Dynamic):
+        response = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
+        yields = of._actuators.yields(response, 0.0)
+    else:
+        impulse = of._motion.finish(moved, x).response[0]
+        response = of.seconds * impulse
+        yields = of._actuators.yields(of.seconds * response, response)
+    dimensions = 3 if finder.axis is None else 2
+    return median_apart(model, data, here[0], response, finder.main_pairs, dimensions), yields
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
@@ -480,19 +485,8 @@ def _check_options(
 def _rebuild(model: Any, disabled: int, first: Any, options: dict[str, Any], now: Any, state: MujocoState) -> MujocoLCS:
     model.opt.disableflags = disabled
     data = mujoco.MjData(model)
-    _take(data, first)
+    take_given(data, first)
     module = MujocoLCS(model, data, **options)
-    _take(module._data, now)
+    take_given(module._data, now)
     module.state = state
     return module
-
-
-def _take(into: Any, data: Any) -> None:
-    """Copy the fields that are not in the state from the caller's data."""
-    for name in TAKEN:
-        field, values = getattr(into, name), getattr(data, name)
-        if values.shape != field.shape:
-            raise InvalidInputError(f"data: expected {name} {field.shape}, got {values.shape}; pass MjData(model)")
-        if not np.isfinite(values).all():
-            raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
-        field[:] = values

@@ -48,11 +48,6 @@ class Softness(NamedTuple):
     margin: Array
     bound: Array
 
-    @property
-    def creep(self) -> Array:
-        """Largest speed at which friction that holds creeps; infinite for limits."""
-        return self.bound * self.yields(1.0, np.inf)
-
     def yields(self, mass: Array | float, seconds: float) -> Array:
         """Speed (n, k) for a unit of force at which friction that holds creeps after a time, where A is `mass`."""
         d = _impedance(np.zeros_like(self.give), self.impedance)
@@ -271,10 +266,10 @@ def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: fl
 
 
 def soften(
-    rows: ScaledRows, found: Rows, step: DynamicStep | None, give: float, compliance: float, n_contacts: int
+    rows: ScaledRows, found: Rows, step: DynamicStep | None, give: float, compliance: float, contacts: Array
 ) -> Array:
     """Compliance (n, n_contacts + k) of contacts and rows; friction in a step with velocities creeps as MuJoCo's."""
-    soft = np.full((len(rows.gap), n_contacts + rows.gap.shape[1]), compliance)
+    soft = np.concatenate([contacts, np.full_like(rows.gap, compliance)], 1)
     if step is not None and (n := found.n_friction):
         creeps = found.soft.yields(give_way(found.normal, step.inverse_mass), step.seconds)[:, -n:] / give
         soft[:, -n:] = np.maximum(compliance, rows.unit[:, -n:] ** 2 * creeps)

@@ -160,8 +160,8 @@ class Dynamic:
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
-        self.tree = np.array(model.dof_treeid)
-        self.firm = np.isin(
+        self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
+        self.firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
@@ -437,26 +437,15 @@ class DynamicStep(NamedTuple):
         return self.motion.seconds
 
     @property
-    def tree(self) -> NDArray[np.intp]:
-        """(nv,) degrees of freedom that belong together: those of different trees move each other by contacts alone."""
-        return self.motion.tree
-
-    @property
-    def firm(self) -> Array:
-        """(n, nv, nv) S if bodies with an actuator at every joint do not give way, as may be with another action."""
-        loose = ~self.motion.firm
-        return self.response * (loose & loose[:, None])
-
-    @property
     def velocity(self) -> Array:
         """(n, nv) velocities."""
         nv = self.place.shape[1]
         return self.x[:, nv : 2 * nv]
 
-    @property
-    def reached(self) -> Array:
-        """(n, n_x) ζ, ν and the change of activation afterwards with the nominal action."""
-        return _reached(self.step, self.velocity)
+    def reached(self, carried: Array) -> list[Array]:
+        """Return ζ and ν (n, nv) afterwards with the nominal action, with `carried` added to motion without contact."""
+        after = self.step[:, : carried.shape[1]] + carried
+        return np.split(_reached(after, self.velocity), 2, -1)
 
     def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
         """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""

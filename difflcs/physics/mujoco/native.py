@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._differentiation import is_wrapped
-from difflcs.errors import InvalidInputError
+from difflcs.errors import InvalidInputError, NonFiniteError
 
 TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
 """Fields of a caller's data that are used besides the state."""
@@ -61,6 +61,21 @@ def copy_taken(into: Any, data: Any) -> None:
     """Copy the fields that are `TAKEN` from one data of a model into another."""
     for name in TAKEN:
         getattr(into, name)[:] = getattr(data, name)
+
+
+def take_given(into: Any, data: Any) -> None:
+    """Copy these fields from the caller's data.
+
+    Raises:
+        InvalidInputError, NonFiniteError: data of another model, or numbers that are not finite.
+    """
+    for name in TAKEN:
+        field, values = getattr(into, name), getattr(data, name)
+        if values.shape != field.shape:
+            raise InvalidInputError(f"data: expected {name} {field.shape}, got {values.shape}; pass MjData(model)")
+        if not np.isfinite(values).all():
+            raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
+        field[:] = values
 
 
 Array = NDArray[np.float64]

@@ -174,28 +174,24 @@ class _Rays:
         return of_contacts.reshape(self.shape), forces[:, len(self._kept) :]
 
 
-def solve_soft(
-    rows: Array, response: Array, gap: Array, compliance: float, low: Array | None = None, high: Array | None = None
-) -> Array:
+def solve_soft(rows: Array, response: Array, gap: Array, compliance: float, low: Array, high: Array) -> Array:
     """Compute forces λ = clip(−(gap + rows · z)/compliance, low, high), with z = response rowsᵀ λ.
 
-    So 0 ≤ λ ⊥ gap + rows · z + compliance · λ ≥ 0 where no bounds are given; between −b and b it is dry friction.
+    So 0 ≤ λ ⊥ gap + rows · z + compliance · λ ≥ 0 between 0 and infinity; between −b and b it is dry friction.
 
     Args:
         rows: (n, m, nv).
         response: (n, nv, nv) motion by forces, symmetric and positive semidefinite.
         gap: (n, m).
         compliance: > 0.
-        low: (n, m) least forces; None: 0.
-        high: (n, m) largest forces; None: infinite.
+        low: (n, m) least forces.
+        high: (n, m) largest forces.
 
     Warns:
         ContactWarning: for some states rounding keeps it from finding them exactly.
     """
     force = np.empty_like(gap)
-    low = np.zeros_like(gap) if low is None else np.ascontiguousarray(low)
-    high = np.full_like(gap, np.inf) if high is None else np.ascontiguousarray(high)
-    rows, gap = np.ascontiguousarray(rows), np.ascontiguousarray(gap)
+    rows, gap, low, high = (np.ascontiguousarray(values) for values in (rows, gap, low, high))
     response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
     threads = max(1, min(len(gap), torch.get_num_threads()))
     missed = _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
@@ -221,11 +217,11 @@ def _settle(at: Situation, at_once: NDArray[np.bool_]) -> tuple[ScaledRows, Arra
         return scale(rows, rows.gap, 1.0, response, give, h), rows.normal
     # First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
     speed = (rows.normal @ step.velocity[:, :, None])[:, :, 0]
-    creeps = np.abs(speed) < rows.soft.creep
+    creeps = np.abs(speed) < rows.soft.bound * rows.soft.yields(1.0, np.inf)
     gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
     scaled = scale(rows, gap, 1.0, response, give, h)
     rays = at.rays(contacts, scaled, step.response)
-    forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
+    forces, moved = rays.forces(step.reached(step.delayed)[0], np.maximum(contacts.gap, 0.0))
     forces = rays.split(forces)[1]
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
     load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
@@ -265,7 +261,7 @@ def evaluate_nominal(at: Situation) -> Nominal:
     nominal, velocity = _evaluate(at, np.zeros(len(step.x), dtype=bool))
     if rows.gap.size and contacts.gap.size:
         mass = 1 / np.diagonal(step.inverse_mass, axis1=1, axis2=2)
-        speeds = step.velocity, _velocity(step, np.zeros_like(step.delayed)), velocity
+        speeds = step.velocity, step.reached(np.zeros_like(step.delayed))[1], velocity
         before, alone, after = (np.sqrt((mass * v * v).sum(-1)) for v in speeds)
         jams = after > _GAINS * (before + alone)
         if jams.any():
@@ -280,7 +276,7 @@ def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array
     closing = _find_closing(step.place, step.response, contacts, held)
     carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]), held)
     # First all that close hold.
-    place, closed = _place(step, carried), np.maximum(contacts.gap, 0.0)
+    place, closed = step.reached(carried)[0], np.maximum(contacts.gap, 0.0)
     contacts = contacts._replace(
         tangent=_turn_tangents(contacts.tangent, np.einsum("nktv,nv->nkt", contacts.tangent, place))
     )
@@ -290,8 +286,9 @@ def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array
     # The drag of Stewart and Trinkle's model holds what slides.
     slides = _find_sliding(slide, contacts, place) & at.opens
     if slides.any() and step.motion.firm.any():
-        # What robots touch may hold with another action than the nominal one.
-        _, firmly = at.rays(contacts, settled, step.firm).forces(place, closed)
+        # What robots touch may hold with another action than the nominal one, with which they do not give way.
+        loose = ~step.motion.firm
+        _, firmly = at.rays(contacts, settled, step.response * (loose & loose[:, None])).forces(place, closed)
         slides &= _find_sliding(np.einsum("nktv,nv->nkt", contacts.tangent, firmly), contacts, place)
     acceleration = give_way(contacts.normal, step.inverse_mass) * normal / step.seconds
     speed = (contacts.normal @ step.velocity[:, :, None])[:, :, 0]
@@ -301,7 +298,7 @@ def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array
     if slides.any():  # else it is as before: what holds does not depend on the directions of the tangents
         carried = _compute_carried(step, contacts, closing, slide, held)
     rays = at.rays(contacts, settled, step.response)
-    place, forces = _place(step, carried), np.zeros_like(forces)
+    (place, velocity), forces = step.reached(carried), np.zeros_like(forces)
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
         opened = gap + contacts.friction * slides * np.linalg.norm(slide, axis=-1)
@@ -310,7 +307,7 @@ def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array
     of_contacts, of_rows = rays.split(forces)
     # What creeps moves the point from which friction counts, which is that of so much compliance.
     creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (at.compliance * at.give)
-    velocity = _velocity(step, carried) + (step.response @ rays.impulse(forces, settled))[:, :, 0]
+    velocity = velocity + (step.response @ rays.impulse(forces, settled))[:, :, 0]
     return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried), velocity
 
 
@@ -324,19 +321,6 @@ def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recove
     acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
     far = step.seconds * friction * recovery.crept(contacts.geom, acceleration, (contacts.tangent * velocity).sum(-1))
     return np.stack([far, -far], -1).reshape(forces.shape)
-
-
-def _place(step: DynamicStep, carried: Array) -> Array:
-    """Compute ζ (n, nv) after the step with the nominal action, with `carried` added to the motion without contact."""
-    nv = step.place.shape[1]
-    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
-
-
-def _velocity(step: DynamicStep, carried: Array) -> Array:
-    """Compute ν (n, nv) likewise."""
-    nv = step.place.shape[1]
-    after = step.step[:, nv : 2 * nv] + carried[:, nv:]
-    return after[:, :, -1] + (after[:, :, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
 
 
 def _find_closing(place: Array, response: Array, contacts: MujocoContacts, held: Array) -> NDArray[np.bool_]:
@@ -380,12 +364,12 @@ def _compute_carried(
 
     The rows `held` (n, k, nv) hold.
     """
-    nv, slides = step.place.shape[1], slide.any(-1)
+    nv, slides, tree = step.place.shape[1], slide.any(-1), step.motion.tree
     tangents = np.moveaxis(contacts.tangent, 2, 0) * (closing & ~slides & (contacts.friction > 0))[:, :, None]
     # What touches without a load may have one with another action.
     normals = contacts.normal * (closing | (contacts.gap < 0))[:, :, None]
     forces = normals - _compute_drag(step, contacts, slide) * closing[:, :, None] if slides.any() else normals
-    rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), step.tree) for v in (normals, forces))
+    rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), tree) for v in (normals, forces))
     some = rows.any((0, 2))
     rows, forces = rows[:, some], forces[:, some]
     delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)
@@ -436,9 +420,7 @@ def _turn_tangents(tangent: Array, slide: Array) -> Array:
         return tangent
     far = np.linalg.norm(slide, axis=-1, keepdims=True)
     along = np.where(far > 1e-9, slide / np.maximum(far, 1e-9), np.eye(count)[0])
-    if count == 2:
-        turned = np.stack([along, np.stack([-along[..., 1], along[..., 0]], -1)], -2)
-    else:  # a reflection that takes the first one there, or to the other side
-        normal = along + np.where(along[..., :1] < 0, -1.0, 1.0) * np.eye(count)[0]
-        turned = 2 * normal[..., None] * normal[..., None, :] / (normal**2).sum(-1)[..., None, None] - np.eye(count)
+    # A reflection takes the first one there, or to the other side.
+    normal = along + np.where(along[..., :1] < 0, -1.0, 1.0) * np.eye(count)[0]
+    turned = 2 * normal[..., None] * normal[..., None, :] / (normal**2).sum(-1)[..., None, None] - np.eye(count)
     return turned @ tangent

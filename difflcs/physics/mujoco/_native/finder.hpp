@@ -32,7 +32,9 @@ struct Geom {
 struct Pair {
   int first, second;
   bool formula, boxes, faces;
-  double size, friction, spin;  // of spinning about the normal, the radius at which friction acts as in sliding
+  double size, friction;
+  double spin;  // of spinning about the normal, the radius at which friction acts as in sliding
+  double rubs;  // the gap below which friction acts along a normal that nothing can move along
 };
 
 // Pairs that share a number of contacts.
@@ -325,10 +327,15 @@ class Finder {
     return (moves(pair.second) - moves(pair.first)) * dot(c.normal, load(place_.cdof + 6 * v));
   }
 
-  // A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
+  // A normal that nothing can move along is that of a body resting on what is outside the plane of motion, or of one
+  // that a geom presses against its rail: it has friction if the two overlap.
   bool moves(const Contact& c) const {
-    for (int v = 0; v < scene_.nv; v++)
-      if (std::fabs(rate(c, c.normal, v)) > kStill) return true;
+    Vector along[3] = {c.normal};
+    const int count = c.gap < scene_.pairs[c.pair].rubs ? 3 : 1;
+    if (count > 1) across(c.normal, along + 1, along + 2);
+    for (int k = 0; k < count; k++)
+      for (int v = 0; v < scene_.nv; v++)
+        if (std::fabs(rate(c, along[k], v)) > kStill) return true;
     return false;
   }
 

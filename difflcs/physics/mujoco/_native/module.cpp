@@ -92,8 +92,9 @@ Scene make_scene(const nb::dict& f) {
   for (size_t p = 0; p < geoms.shape(0); p++) {
     const int64_t* of = geoms.data() + 2 * p;
     const bool* flag = flags.data() + 3 * p;
+    const double* number = numbers.data() + 4 * p;
     s.pairs.push_back({static_cast<int>(of[0]), static_cast<int>(of[1]), flag[0], flag[1], flag[2],
-                       numbers.data()[3 * p], numbers.data()[3 * p + 1], numbers.data()[3 * p + 2]});
+                       number[0], number[1], number[2], number[3]});
   }
   for (const auto& [begin, end, count, distance] : value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
     s.groups.push_back({begin, end, count, distance});

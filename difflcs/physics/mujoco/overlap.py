@@ -1,0 +1,86 @@
+"""Soft contacts: overlaps in which MuJoCo's force depends on its softness, and hardly on what it moves.
+
+In a row J of a contact with depth r, velocity v and acceleration a, MuJoCo's force is (k d r − b v − a)/R. Its R comes
+from the inertia of the bodies in the model's initial state. Where A = J M⁻¹ Jᵀ is far smaller, as along a normal across
+the rail of a drawer, or of a finger that lies inside the hand near its axis, the force is that of a spring and damper,
+whatever moves, and friction has what it presses. These contacts have this force and compliance in a step.
+"""
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from difflcs.physics.complementarity import count_forces
+from difflcs.physics.mujoco.limits import give_way
+from difflcs.physics.mujoco.native import native
+from difflcs.physics.mujoco.nominal import Nominal, Situation, evaluate_nominal
+
+Array = NDArray[np.float64]
+_SOFT = 3.0  # R in parts of A, above which a contact is soft
+_LEAST, _MOST = 1e-4, 1e4  # compliance in parts of how far contacts give way
+
+
+class Overlaps(NamedTuple):
+    """Soft contacts of n states.
+
+    Attributes:
+        soft: (n, n_contacts) True for those that are soft.
+        gap: (n, n_contacts) from which the rays of soft contacts count [m].
+        compliance: (n, n_contacts) of all contacts, in parts of how far they give way.
+    """
+
+    soft: NDArray[np.bool_]
+    gap: Array
+    compliance: Array
+
+    def evaluate(self, at: Situation) -> Nominal:
+        """Evaluate all else at the nominal action, with friction that holds, and add the soft contacts of a step."""
+        normal, hard = at.contacts.normal, ~self.soft[:, :, None]
+        nominal = evaluate_nominal(at._replace(contacts=at.contacts._replace(normal=normal * hard)))
+        gap = np.where(self.soft, self.gap, nominal.contacts.gap)
+        contacts = nominal.contacts._replace(gap=gap, normal=normal)
+        return nominal._replace(contacts=contacts, forces=nominal.forces * hard)
+
+
+def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps:
+    """Find the soft contacts at positions (n, nq), with MuJoCo's parameters.
+
+    Args:
+        model: a model that has contacts and no other constraints.
+        data: for the computation.
+        qpos: positions.
+        at: what acts there.
+
+    Raises:
+        InvalidInputError: MuJoCo raised an error.
+    """
+    contacts, geoms = at.contacts, np.sort(at.contacts.geom, -1)
+    moves = give_way(contacts.normal, at.step.inverse_mass)
+    ease = (1 / np.clip(model.geom_solimp[:, 0], 1e-4, 0.9999) - 1).max(initial=0.0)
+    most = ease * model.body_invweight0[model.geom_bodyid, 0][geoms].sum(-1)
+    soft = (contacts.gap < 0) & (contacts.friction > 0) & at.rough & (most > _SOFT * moves)
+    firm, force = np.zeros_like(moves), np.zeros_like(moves)
+    for i in np.flatnonzero(soft.any(-1)):
+        with native(model, data, f"in state {i} of {len(qpos)}"):
+            data.qpos[:] = qpos[i]
+            mujoco.mj_fwdPosition(model, data)
+        for contact in data.contact:
+            row, mine = contact.efc_address, (geoms[i] == np.sort(contact.geom)).all(-1)
+            if row < 0 or not mine.any():
+                continue
+            edges = 2 * (contact.dim - 1) * (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
+            of_normal, of_tangent = data.efc_R[row], data.efc_R[row + (contact.dim > 1)]
+            if edges:
+                of_normal, of_tangent = of_normal / edges, of_normal / (2 * contact.friction[0] ** 2)
+            stiffness, damping, impedance = data.efc_KBIP[row, :3]
+            depth = data.efc_margin[row] - data.efc_pos[row]
+            share = mine * (of_normal > _SOFT * moves[i]) / mine.sum()
+            firm[i] += share * damping / of_tangent
+            force[i] += share * stiffness * impedance * depth / of_normal
+    soft &= force > 0
+    compliance = np.clip(2 * contacts.friction**2 / np.maximum(at.give * firm, 1e-99), _LEAST, _MOST)
+    rays = count_forces(1, contacts.tangent.shape[2]) if at.opens else 1
+    gap = -at.give * compliance * at.step.seconds * force / rays
+    return Overlaps(soft, gap, np.where(soft, compliance, at.compliance))
