@@ -31,7 +31,7 @@ CPU_TORCH := [ "$$(uname)" != Linux ] || command -v nvidia-smi >/dev/null || { \
 # .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the
 # packages, with the kernels for the CPU that is here, which compile in half the time.
 SOURCES := pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake \
-  $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
+  $(wildcard $(addsuffix /_native/*.[ch]*,difflcs difflcs/physics/mujoco envs/difflcs_envs))
 $(VENV)/.ready: EXTRAS := all
 $(VENV)/.ready: ISAS := all
 $(VENV)/.demo: EXTRAS := rl,envs,viz
