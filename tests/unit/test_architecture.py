@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import graphlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,26 +39,19 @@ SOURCES = {
 }
 
 
-def is_type_checking(node: ast.stmt) -> bool:
+def is_type_checking(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 
 def imports(tree: ast.Module, types: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
     """Import statements that are run, with `types` those for type checkers too, and whether at the import."""
-
-    def walk(nodes: list[ast.stmt], top: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-        for node in nodes:
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                yield node, top
-                continue
-            inside = top and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            for field in ("body", "orelse", "finalbody"):
-                if types or not (field == "body" and is_type_checking(node)):
-                    yield from walk(getattr(node, field, []), inside)
-            for handler in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
-                yield from walk(handler.body, inside)
-
-    return walk(tree.body, True)
+    functions, for_types = (
+        {inner for outer in ast.walk(tree) if kind(outer) for inner in ast.walk(outer)}
+        for kind in (lambda node: isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef), is_type_checking)
+    )
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom) and (types or node not in for_types):
+            yield node, node not in functions
 
 
 def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
@@ -93,26 +87,6 @@ def graph(*, functions: bool, types: bool = False) -> dict[str, set[str]]:
     return edges
 
 
-def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
-    """One circle through each module that is found twice on a path."""
-    found: list[list[str]] = []
-    done: set[str] = set()
-
-    def visit(module: str, path: list[str]) -> None:
-        if module in path:
-            found.append([*path[path.index(module) :], module])
-            return
-        if module in done:
-            return
-        for target in sorted(edges[module]):
-            visit(target, [*path, module])
-        done.add(module)
-
-    for module in sorted(edges):
-        visit(module, [])
-    return found
-
-
 def packages_of(edges: dict[str, set[str]], package: str, other: str) -> dict[str, set[str]]:
     return {
         module: {target for target in found if target.split(".")[0] == other}
@@ -138,7 +112,7 @@ def layer_of(module: str) -> int | None:
 
 
 def test_no_circle_of_imports():
-    assert cycles(graph(functions=False, types=True)) == []
+    graphlib.TopologicalSorter(graph(functions=False, types=True)).prepare()  # else it names a circle
 
 
 def test_imports_go_one_way():

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,19 +31,17 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class _Graph:
     index: Tensor  # batch elements of this call
-    parameters: list[Tensor]  # leaves, in the order of `_parameters`
-    outputs: tuple[Tensor, ...]  # x, u, λ, multiplier of s ≥ 0; functions of the leaves
+    parameters: list[Tensor]  # leaves, as `_parameters` lists them
+    z: Tensor  # (elements, n) function of the leaves
 
 
-@dataclass(frozen=True)
-class _Pass:
+class _Pass(NamedTuple):
     """One convex program and the graphs through which cvxpylayers differentiates it, one per call of the layer."""
 
     nominal: Tensor  # (batch, H, n_u)
     penalty: float
-    graphs: tuple[_Graph, ...]
-    plan: Primal
-    residual: Tensor  # (batch,)
+    graphs: list[_Graph]
+    z: Tensor  # (batch, n) the solution
 
 
 @dataclass(frozen=True)
@@ -84,11 +82,9 @@ class RelaxedBackend(Backend):
     Executed in synthetic pushing models, they cost 3 % more than those of `batched` (docs/archive/older_results.md). A
     solve takes 200 to 300 times as long: this backend is for comparison, not for speed.
 
-    Gradients are cvxpylayers' for the program's parameters, chained by torch through the nominal trajectory and the
-    passes; they are those of the whole map, a guess held. Q, R and Q_final must enter cvxpy as square roots, whose
-    derivative is infinite where they are singular; their gradient is taken from the linear terms instead: a change dQ
-    acts on the solution x like the change dQ·x of q. diffcp differentiates a dense matrix; its default, LSQR, did not
-    converge on these programs.
+    cvxpylayers has the program in u and λ alone. Its gradients for the parameters of that program are chained by torch
+    through the nominal trajectory and the passes; they are those of the whole map, a guess held. diffcp differentiates
+    a dense matrix; its default, LSQR, did not converge on these programs.
 
     The solver's plan is polished by Newton steps on the program itself. `iterations` counts the passes.
 
@@ -134,14 +130,17 @@ class RelaxedBackend(Backend):
         batch = problem.batch
         zero = torch.zeros(batch, problem.horizon, problem.n_u, dtype=torch.float64)
         nominal = zero if guess is None else torch.nan_to_num(guess.u, posinf=0.0, neginf=0.0)
+        inputs = {name: getattr(problem, name) for name in INPUTS}
         failed = torch.zeros(batch, dtype=torch.bool)
         passes: list[_Pass] = []
         for penalty in self.penalties if guess is None else self.penalties[-1:]:
-            passes.append(self._pass(problem, nominal, penalty))
-            failed |= ~(passes[-1].residual <= self.residual_tol)
-            primal = replace_failed(problem, passes[-1].plan, failed)
+            program = _condense(inputs, nominal, problem.relaxation, penalty)
+            graphs, z, mu = self._call_layer(problem, program)
+            primal, residual = _polish(problem, program, z, mu)
+            passes.append(_Pass(nominal, penalty, graphs, torch.cat([v.flatten(1) for v in primal[1:3]], 1)))
+            failed |= ~(residual <= self.residual_tol)
+            primal = replace_failed(problem, primal, failed)
             nominal = primal.u
-        residual = passes[-1].residual
         return RelaxedResult(
             primal=primal,
             status=torch.where(failed, int(Status.NUMERICAL), int(Status.CONVERGED)).to(torch.int8),
@@ -158,57 +157,41 @@ class RelaxedBackend(Backend):
         assert isinstance(result, RelaxedResult)
         index = torch.nonzero(solved).squeeze(-1)
         inputs = {name: getattr(problem, name).clone().requires_grad_() for name in INPUTS}
-        with torch.enable_grad():  # unsolved elements may hold infinities: they take no part
-            part = {k: v if problem.shared(k) else v[index] for k, v in inputs.items()}
-            x, u = (v[index].requires_grad_() for v in result.primal[:2])
-            objective = replace(problem, **part).objective(x, u)
-        *total, x_bar, u_bar = _pull([objective], [*inputs.values(), x, u], [grads[3][index]])
-        upstream = [v.clone() for v in grads[:3]]
-        upstream[0][index] += x_bar
-        upstream[1][index] += u_bar
+        total = [torch.zeros_like(v) for v in inputs.values()]
+        bars = [v[index] for v in grads]
         for step in reversed(result.passes):
-            nominal = step.nominal[index].requires_grad_()
-            plan = Primal(*(v[index] for v in step.plan))
-            with torch.enable_grad():
-                parameters = _parameters(part, nominal, problem.relaxation, step.penalty, plan)
-            bars = [v.new_zeros(problem.batch, *v.shape[1:]) for v in parameters]
+            nominal, z = (v[index].requires_grad_() for v in (step.nominal, step.z))
+            with torch.enable_grad():  # unsolved elements may hold infinities: they take no part
+                part = {k: v if problem.shared(k) else v[index] for k, v in inputs.items()}
+                program = _condense(part, nominal, problem.relaxation, step.penalty)
+                u, lam = program.split(z)
+                x = matvec(program.X, torch.cat([z, torch.ones_like(z[:, :1])], 1).unsqueeze(1))
+                parameters = _parameters(program, z)
+                outputs = [x, u, lam, replace(problem, **part).objective(x, u)] if len(bars) > 1 else [u]
+            *direct, z_bar = _pull(outputs, [*inputs.values(), z], bars)
+            seeds = z.new_zeros(problem.batch, z.shape[1]).index_copy(0, index, z_bar)
+            parameter_bars = [v.new_zeros(problem.batch, *v.shape[1:]) for v in parameters]
             for graph in step.graphs:
-                seeds = [v[graph.index] for v in upstream]
-                with _quiet(), _interruptible():
-                    parts = torch.autograd.grad(graph.outputs[:3], graph.parameters, seeds, retain_graph=True)
-                for bar, value in zip(bars, parts, strict=True):
+                with _cvxpylayers():
+                    parts = torch.autograd.grad(graph.z, graph.parameters, seeds[graph.index], retain_graph=True)
+                for bar, value in zip(parameter_bars, parts, strict=True):
                     bar[graph.index] = value
-            *more, nominal_bar = _pull(parameters, [*inputs.values(), nominal], [bar[index] for bar in bars])
-            total = [a + b for a, b in zip(total, more, strict=True)]
-            upstream = [torch.zeros_like(v) for v in upstream]
-            upstream[1][index] = nominal_bar
+            bars = [v[index] for v in parameter_bars[_HELD:]]
+            *more, nominal_bar = _pull(parameters[_HELD:], [*inputs.values(), nominal], bars)
+            total = [a + b + c for a, b, c in zip(total, direct, more, strict=True)]
+            bars = [nominal_bar]
         gradients = dict(zip(INPUTS, total, strict=True))
         return {k: 0.5 * (v + v.mT) if k in ("Q", "R", "Q_final") else v for k, v in gradients.items()}
 
-    def _pass(self, problem: MPCProblem, nominal: Tensor, penalty: float) -> _Pass:
-        """Solve the batch in one call of the layer; element by element where that raises."""
-        start = problem.start(nominal)
-        x, lam = problem.rollout(start)
-        inputs = {name: getattr(problem, name) for name in INPUTS}
-        parameters = _parameters(
-            inputs, nominal, problem.relaxation, penalty, Primal(x, start, lam, problem.no_multipliers())
-        )
-        layer = _layer(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, problem.barrier)
-        usable = torch.stack([torch.isfinite(v).flatten(1).all(1) for v in parameters]).all(0)
-        index = torch.nonzero(usable).squeeze(-1)
-        graphs = self._call(layer, parameters, index) if len(index) else ()
-        if not graphs and len(index) > 1:
-            graphs = tuple(graph for i in index for graph in self._call(layer, parameters, i.reshape(1)))
-        u, lam, mu = (torch.full_like(v, torch.nan) for v in (start, lam, lam))
-        for graph in graphs:
-            for whole, value in zip((u, lam, mu), graph.outputs[1:], strict=True):
-                whole[graph.index] = value.detach()
-        plan, residual = _polish(problem, u, lam, mu, *parameters[-3:])
-        return _Pass(nominal, penalty, graphs, plan, residual)
+    def _call_layer(self, problem: MPCProblem, program: _Program) -> tuple[list[_Graph], Tensor, Tensor]:
+        """Solve the batch in one call of the layer; element by element where that raises.
 
-    def _call(self, layer: CvxpyLayer, parameters: list[Tensor], index: Tensor) -> tuple[_Graph, ...]:
-        """Call the layer once; return nothing if the solver raises."""
-        leaves = [v[index].requires_grad_() for v in parameters]
+        Returns:
+            The graphs, z (batch, n) and the multiplier of s ≥ 0 (batch, H·n_lam), NaN where the solver gave none.
+        """
+        n_s, n = program.S.shape[1], program.S.shape[2] - 1
+        parameters = _parameters(program, program.nominal)
+        layer = _layer(n, program.u_min.shape[1], n_s, problem.barrier)
         threads = self.threads or torch.get_num_threads()
         options = {
             "solve_method": "Clarabel",
@@ -219,12 +202,21 @@ class RelaxedBackend(Backend):
             "tol_gap_rel": self.tol,
             "tol_feas": self.tol,
         }
-        try:
-            with torch.enable_grad(), _quiet(), _interruptible():
-                outputs = layer(*leaves, solver_args=options)
-        except Exception:  # whatever a solver raises stays with its elements
-            return ()
-        return (_Graph(index, leaves, outputs),)
+        usable = torch.stack([torch.isfinite(v).flatten(1).all(1) for v in parameters]).all(0)
+        graphs: list[_Graph] = []
+        z, mu = (torch.full((problem.batch, size), torch.nan, dtype=torch.float64) for size in (n, n_s))
+        waiting = [torch.nonzero(usable).squeeze(-1)]
+        while waiting and len(index := waiting.pop(0)):
+            leaves = [v[index].requires_grad_() for v in parameters]
+            try:
+                with torch.enable_grad(), _cvxpylayers():
+                    outputs = layer(*leaves, solver_args=options)
+            except Exception:  # whatever a solver raises stays with its elements
+                waiting += index.split(1) if len(index) > 1 else ()
+                continue
+            graphs.append(_Graph(index, leaves, outputs[0]))
+            z[index], mu[index] = (v.detach() for v in outputs)
+        return graphs, z, mu
 
 
 @contextmanager
@@ -239,245 +231,202 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """Join diffcp's threads at exit after Ctrl-C: they finish their element and would abort an ended interpreter."""
+def _cvxpylayers() -> Iterator[None]:
+    """Call cvxpylayers without the one warning that version 1.2 causes with NumPy 2 at every call.
+
+    After Ctrl-C diffcp's threads are joined at exit: they finish their element and would abort an ended interpreter.
+    """
     before = set(threading.enumerate())
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "__array__ implementation doesn't accept a copy", DeprecationWarning)
+            yield
     except KeyboardInterrupt:
         for thread in set(threading.enumerate()) - before:
             atexit.register(thread.join)
         raise
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hide the one warning that cvxpylayers 1.2 causes with NumPy 2 at every call."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "__array__ implementation doesn't accept a copy", DeprecationWarning)
-        yield
-
-
 # Weight that makes λ unique where it moves no state. At 1e-3 diffcp's gradient of such a λ is off by 1 % and more.
 _TIE = 1e-2
 _STEPS = 3  # of Newton, to polish a plan
-_PLAIN = ("A", "B", "C", "d", "D", "E", "F", "c", "u_min", "u_max", "x0")
+_HELD = 2  # the first parameters, which have no gradient of their own
 
 
-def _weights(horizon: int) -> tuple[str, ...]:
-    """List the weights that act on an action or on a state after x0."""
-    return ("Q", "R", "Q_final") if horizon > 1 else ("R", "Q_final")
+class _Program(NamedTuple):
+    """The program in z = (u, λ) alone, n numbers: x and s are affine in z. Matrices act on (z, 1)."""
+
+    X: Tensor  # (batch, H + 1, n_x, n + 1) the states
+    S: Tensor  # (batch, H·n_lam, n + 1) s
+    W: Tensor  # (batch, n + 1, n + 1) symmetric: ½ (z, 1)ᵀ W (z, 1) is the cost with the penalty, up to a constant
+    u_min: Tensor  # (batch, H·n_u)
+    u_max: Tensor
+    nominal: Tensor  # (batch, n) z of the nominal trajectory
+
+    def split(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Split z into u (batch, H, n_u) and λ (batch, H, n_lam)."""
+        horizon = self.X.shape[1] - 1
+        u, lam = z.split([self.u_min.shape[1], self.S.shape[1]], 1)
+        return u.unflatten(1, (horizon, -1)), lam.unflatten(1, (horizon, -1))
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the bounds (batch, n) of z."""
+        least = self.S.new_zeros(self.S.shape[:2])
+        return torch.cat([self.u_min, least], 1), torch.cat([self.u_max, least + torch.inf], 1)
+
+
+@_one_thread()
+def _condense(t: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float) -> _Program:
+    """Build the program; differentiable in the inputs and the nominal actions (batch, H, n_u)."""
+    batch, horizon, n_u = nominal.shape
+    n_lam = t["F"].shape[-1]
+    n = horizon * (n_u + n_lam)
+    eye = torch.eye(n + 1, dtype=torch.float64)
+    of_u, of_lam, one = eye.split([horizon * n_u, horizon * n_lam, 1])
+    U, L = of_u.unflatten(0, (horizon, n_u)), of_lam.unflatten(0, (horizon, n_lam))
+    low, high = (t[k].expand(batch, n_u).unsqueeze(1).expand(batch, horizon, n_u) for k in ("u_min", "u_max"))
+    u_bar = torch.minimum(torch.maximum(nominal, low), high)
+    unit = t["F"].diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def constant(vector: Tensor) -> Tensor:
+        return vector.unsqueeze(-1) * one
+
+    def quadratic(matrix: Tensor, vector: Tensor, rows: Tensor) -> Tensor:
+        linear = rows.mT @ constant(vector)
+        return rows.mT @ matrix @ rows + linear + linear.mT
+
+    lams: list[Tensor] = []
+    x_bar, X, S, W = t["x0"], [constant(t["x0"])], [], eye.new_zeros(batch, n + 1, n + 1)
+    for k in range(horizon):
+        gap = matvec(t["D"], x_bar) + matvec(t["E"], u_bar[:, k]) + t["c"]
+        lam = solve_lcp(t["F"], gap, relaxation=relaxation).lam
+        x_bar = matvec(t["A"], x_bar) + matvec(t["B"], u_bar[:, k]) + matvec(t["C"], lam) + t["d"]
+        lams.append(lam)
+        force, slack = lam * unit, relaxation / (lam * unit)
+        rest = (horizon - 1 - k) * t["Q"] + t["Q_final"]
+        moved = (t["C"] * (rest @ t["C"])).sum(-2) / unit.square()
+        weight = (penalty * moved + _TIE).sqrt() / (force + slack)
+        alpha, beta, gamma = weight * slack * unit, weight * force / unit, weight * 2 * relaxation
+        S.append(t["D"] @ X[k] + t["E"] @ U[k] + t["F"] @ L[k] + constant(t["c"]))
+        X.append(t["A"] @ X[k] + t["B"] @ U[k] + t["C"] @ L[k] + constant(t["d"]))
+        row = alpha.unsqueeze(-1) * L[k] + beta.unsqueeze(-1) * S[k] - constant(gamma)
+        of_x = ("Q_final", "q_final") if k == horizon - 1 else ("Q", "q")
+        W = W + quadratic(t[of_x[0]], t[of_x[1]], X[k + 1]) + quadratic(t["R"], t["r"], U[k]) + row.mT @ row
+    z_bar = torch.cat([u_bar.flatten(1), *lams], 1)
+    return _Program(torch.stack(X, 1), torch.cat(S, 1), W, low.flatten(1), high.flatten(1), z_bar)
+
+
+def _parameters(program: _Program, around: Tensor) -> list[Tensor]:
+    """List the layer's parameters (batch, ...), with the cost ½‖Lᵀ(z − around)‖² + gᵀz for any `around` (batch, n).
+
+    The root L has an infinite derivative where the Hessian H is singular, so it is held: a change dH acts on the
+    solution z like the change dH·z of g. Derivatives are right around the solution.
+    """
+    H, S = program.W[:, :-1, :-1], program.S
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(H.detach(), nan=0.0, posinf=0.0, neginf=0.0))
+    L = vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
+    centre, g = matvec(L.mT, around.detach()), matvec(H, around) + program.W[:, :-1, -1]
+    return [L, centre, g, S[..., :-1], S[..., -1], program.u_min, program.u_max]
 
 
 @lru_cache(maxsize=32)
-def _layer(n_x: int, n_u: int, n_lam: int, horizon: int, barrier: float) -> CvxpyLayer:
-    """Build the program with the parameters of `_parameters`; once for each size."""
+def _layer(n: int, n_u: int, n_s: int, barrier: float) -> CvxpyLayer:
+    """Build the layer for the parameters of `_parameters`, once for each size; n_u actions come first in z."""
     import cvxpy as cp
     from cvxpylayers.torch import CvxpyLayer  # pyright: ignore[reportPrivateImportUsage]
 
-    sizes = {"n_x": n_x, "n_u": n_u, "n_lam": n_lam}
-    names = (*_PLAIN, *_weights(horizon))
-    p = {name: cp.Parameter(tuple(sizes[dim] for dim in INPUTS[name]), name=name) for name in names}
-    x_linear, u_linear = cp.Parameter((horizon, n_x)), cp.Parameter((horizon, n_u))
-    x_centre, u_centre = cp.Parameter((horizon, n_x)), cp.Parameter((horizon, n_u))
-    alpha, beta, gamma = (cp.Parameter((horizon, n_lam)) for _ in range(3))
-    x, u = cp.Variable((horizon + 1, n_x)), cp.Variable((horizon, n_u))
-    lam, s = cp.Variable((horizon, n_lam)), cp.Variable((horizon, n_lam))
-
-    positive = s >= 0
-    constraints = [x[0] == p["x0"], positive, lam >= 0]
-    squares = [cp.multiply(alpha, lam) + cp.multiply(beta, s) - gamma]
-    cost = cp.sum(cp.multiply(x_linear, x[1:])) + cp.sum(cp.multiply(u_linear, u))
-    for k in range(horizon):
-        constraints += [
-            x[k + 1] == p["A"] @ x[k] + p["B"] @ u[k] + p["C"] @ lam[k] + p["d"],
-            s[k] == p["D"] @ x[k] + p["E"] @ u[k] + p["F"] @ lam[k] + p["c"],
-            u[k] >= p["u_min"],
-            u[k] <= p["u_max"],
-        ]
-        root = p["Q_final" if k == horizon - 1 else "Q"]
-        squares += [root.T @ x[k + 1] - x_centre[k], p["R"].T @ u[k] - u_centre[k]]
-        if barrier > 0:
-            cost -= barrier * cp.sum(cp.log(u[k] - p["u_min"]) + cp.log(p["u_max"] - u[k]))
-    cost += 0.5 * cp.sum_squares(cp.hstack([cp.vec(v, order="C") for v in squares]))
-    used = [p[name] for name in names]
+    sizes = ((n, n), (n,), (n,), (n_s, n), (n_s,), (n_u,), (n_u,))
+    L, centre, g, S, s, u_min, u_max = parameters = [cp.Parameter(size) for size in sizes]
+    z = cp.Variable(n)
+    positive = S @ z + s >= 0
+    cost = 0.5 * cp.sum_squares(L.T @ z - centre) + g @ z
+    if barrier > 0:
+        cost -= barrier * cp.sum(cp.log(z[:n_u] - u_min) + cp.log(u_max - z[:n_u]))
     return CvxpyLayer(
-        cp.Problem(cp.Minimize(cost), constraints),
-        parameters=[*used, x_linear, u_linear, x_centre, u_centre, alpha, beta, gamma],
-        variables=[x, u, lam, positive.dual_variables[0]],
-        # Not MOREAU: cvxpylayers 1.2 with it drops `lam >= 0` in silence.
+        cp.Problem(cp.Minimize(cost), [positive, z[:n_u] >= u_min, z[:n_u] <= u_max, z[n_u:] >= 0]),
+        parameters=parameters,
+        variables=[z, positive.dual_variables[0]],
+        # Not MOREAU: cvxpylayers 1.2 with it drops the bound of λ in silence.
         solver="DIFFCP",
     )
 
 
 @_one_thread()
-def _parameters(
-    inputs: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float, centre: Primal
-) -> list[Tensor]:
-    """Compute the layer's parameters (batch, ...) from the inputs; differentiable, Q, R, Q_final around `centre` only.
-
-    The quadratic cost enters as ½‖L(z − centre)‖² + (Q·centre + q)ᵀz, which differs from ½zᵀQz + qᵀz by a constant.
-    """
-    batch, horizon, _ = nominal.shape
-    t = {name: v.expand(batch, *v.shape[v.ndim - len(INPUTS[name]) :]) for name, v in inputs.items()}
-    alpha, beta, gamma = _linearise(t, nominal, relaxation, penalty)
-    weights = [t["Q"]] * (horizon - 1) + [t["Q_final"]]
-    linear = [t["q"]] * (horizon - 1) + [t["q_final"]]
-    x_linear = torch.stack([matvec(W, centre.x[:, k + 1]) + linear[k] for k, W in enumerate(weights)], 1)
-    u_linear = torch.stack([matvec(t["R"], v) + t["r"] for v in centre.u.unbind(1)], 1)
-    roots = {name: _root(t[name].detach()) for name in _weights(horizon)}
-    x_roots = [roots["Q"] for _ in range(horizon - 1)] + [roots["Q_final"]]
-    x_centre = torch.stack([matvec(L.mT, centre.x[:, k + 1]) for k, L in enumerate(x_roots)], 1)
-    u_centre = torch.stack([matvec(roots["R"].mT, v) for v in centre.u.unbind(1)], 1)
-    plain = [t[name] for name in _PLAIN]
-    return [*plain, *roots.values(), x_linear, u_linear, x_centre, u_centre, alpha, beta, gamma]
-
-
-def _linearise(
-    t: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the weighted rows α∘λ + β∘s − γ of the penalty, each (batch, H, n_lam)."""
-    u = torch.minimum(torch.maximum(nominal, t["u_min"].unsqueeze(1)), t["u_max"].unsqueeze(1))
-    horizon = nominal.shape[1]
-    unit = t["F"].diagonal(dim1=-2, dim2=-1).sqrt()
-    x, rows = t["x0"], []
-    for k in range(horizon):
-        gap = matvec(t["D"], x) + matvec(t["E"], u[:, k]) + t["c"]
-        lam = solve_lcp(t["F"], gap, relaxation=relaxation).lam
-        force, slack = lam * unit, relaxation / (lam * unit)
-        W = (horizon - 1 - k) * t["Q"] + t["Q_final"]
-        moved = (t["C"] * (W @ t["C"])).sum(-2) / unit.square()
-        weight = (penalty * moved + _TIE).sqrt() / (force + slack)
-        rows.append((weight * slack * unit, weight * force / unit, weight * 2 * relaxation))
-        x = matvec(t["A"], x) + matvec(t["B"], u[:, k]) + matvec(t["C"], lam) + t["d"]
-    alpha, beta, gamma = (torch.stack(v, 1) for v in zip(*rows, strict=True))
-    return alpha, beta, gamma
-
-
-@_one_thread()
 def _pull(outputs: list[Tensor], inputs: list[Tensor], bars: list[Tensor]) -> list[Tensor]:
     """Compute the gradients of the inputs, zero where nothing depends on one."""
-    pairs = [(v, bar) for v, bar in zip(outputs, bars, strict=True) if v.requires_grad]
-    values, upstream = zip(*pairs, strict=True)
-    return list(
-        torch.autograd.grad(values, inputs, upstream, retain_graph=True, allow_unused=True, materialize_grads=True)
-    )
-
-
-def _root(matrix: Tensor) -> Tensor:
-    """Compute L with L Lᵀ = matrix, for a positive semi-definite one that may be singular."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
+    options = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
+    return list(torch.autograd.grad(outputs, inputs, bars, **options))
 
 
 @_one_thread()
-def _polish(problem: MPCProblem, u: Tensor, lam: Tensor, mu: Tensor, *row: Tensor) -> tuple[Primal, Tensor]:
+def _polish(problem: MPCProblem, program: _Program, z: Tensor, mu: Tensor) -> tuple[Primal, Tensor]:
     """Improve a plan by Newton steps on the program with its active bounds held; each element keeps its best point.
 
-    A conic solver is accurate only to its tolerance, which shows in difference quotients.
-
-    Args:
-        problem: the problems.
-        u: (batch, H, n_u) solver's actions.
-        lam: (batch, H, n_lam) solver's λ.
-        mu: (batch, H, n_lam) solver's multiplier of s ≥ 0.
-        row: α, β, γ of the penalty.
-
-    Returns:
-        The trajectory with exact dynamics, bounds and λ ≥ 0, and its residual (batch,), NaN where the solver gave none.
+    A conic solver is accurate only to its tolerance, which shows in difference quotients. Of its plan z and multiplier
+    of s ≥ 0 a trajectory is made with exact dynamics, bounds and λ ≥ 0. Its residual (batch,) is NaN where there is no
+    plan.
     """
-    best = point = _Point.at(problem, u, lam, mu, *row)
+    best = point = _Point.at(problem, program, z, mu)
     for _ in range(_STEPS):
-        point = _Point.at(problem, *point.newton(problem), *row)
+        point = _Point.at(problem, program, *point.newton(problem, program))
         better = point.residual < best.residual
-        primal = (torch.where(better[:, None, None], a, b) for a, b in zip(point.primal, best.primal, strict=True))
-        best = replace(best, primal=Primal(*primal), residual=torch.where(better, point.residual, best.residual))
-    return best.primal, best.residual
+        pairs = zip(point, best, strict=True)
+        best = _Point(*(torch.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in pairs))
+    u, lam = program.split(best.z)
+    return Primal(best.x, u, lam, problem.no_multipliers()), best.residual
 
 
-@dataclass(frozen=True)
-class _Point:
-    """The program in z = (u, λ) alone, at one point: x and s are affine in z."""
+class _Point(NamedTuple):
+    """The program at one point inside the bounds."""
 
-    primal: Primal
+    z: Tensor  # (batch, n)
     mu: Tensor  # (batch, H·n_lam) multiplier of s ≥ 0
+    x: Tensor  # (batch, H + 1, n_x)
     s: Tensor  # (batch, H·n_lam)
-    S: Tensor  # (batch, H·n_lam, n) ds/dz
     gradient: Tensor  # (batch, n) of the cost with penalty
     hessian: Tensor  # (batch, n, n) of the same
-    low: Tensor  # (batch, n) bounds of z
-    high: Tensor
     residual: Tensor  # (batch,)
 
     @classmethod
-    def at(
-        cls, problem: MPCProblem, u: Tensor, lam: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor
-    ) -> _Point:
-        batch, H, n_x, n_u, n_lam = problem.batch, problem.horizon, problem.n_x, problem.n_u, problem.n_lam
-        u, lam = problem.clip(u), lam.clamp_min(0.0)
-        n = H * (n_u + n_lam)
-        gradient, hessian = (torch.zeros(batch, *size, dtype=torch.float64) for size in ((n,), (n, n)))
-        X = torch.zeros(batch, n_x, n, dtype=torch.float64)  # dx/dz
-        x, slacks, slopes, size = [problem.x0], [], [], torch.ones(batch, dtype=torch.float64)
-        for k in range(H):
-            in_u = slice(k * n_u, (k + 1) * n_u)
-            in_lam = slice(H * n_u + k * n_lam, H * n_u + (k + 1) * n_lam)
-            s, S = problem.gap(x[k], u[:, k], lam[:, k]), problem.D @ X
-            S[:, :, in_u] += problem.E
-            S[:, :, in_lam] += problem.F
-            row = beta[:, k, :, None] * S
-            row[:, :, in_lam] += torch.diag_embed(alpha[:, k])
-            x.append(problem.next_state(x[k], u[:, k], lam[:, k]))
-            X = problem.A @ X
-            X[:, :, in_u] += problem.B
-            X[:, :, in_lam] += problem.C
-            last = k == H - 1
-            Q, q = (problem.Q_final, problem.q_final) if last else (problem.Q, problem.q)
-            state_gradient = matvec(Q, x[-1]) + q
-            gradient += matvec(X.mT, state_gradient)
-            gradient += matvec(row.mT, alpha[:, k] * lam[:, k] + beta[:, k] * s - gamma[:, k])
-            gradient[:, in_u] += matvec(problem.R, u[:, k]) + problem.r
-            hessian += X.mT @ (Q @ X) + row.mT @ row
-            hessian[:, in_u, in_u] += problem.R
-            slacks.append(s)
-            slopes.append(S)
-            size = torch.maximum(size, state_gradient.abs().amax(-1))
+    def at(cls, problem: MPCProblem, program: _Program, z: Tensor, mu: Tensor) -> _Point:
+        z = z.clamp(*program.bounds())
+        u, lam = program.split(z)
+        states, slacks = [problem.x0], []
+        for k in range(problem.horizon):
+            slacks.append(problem.gap(states[k], u[:, k], lam[:, k]))
+            states.append(problem.next_state(states[k], u[:, k], lam[:, k]))
+        x, s = torch.stack(states, 1), torch.cat(slacks, 1)
+        gradient, hessian = matvec(program.W[:, :-1, :-1], z) + program.W[:, :-1, -1], program.W[:, :-1, :-1].clone()
         if problem.barrier > 0:
             below, above = (v.flatten(1) for v in problem.distances(u))
-            gradient[:, : H * n_u] += problem.barrier * (1 / above - 1 / below)
-            hessian.diagonal(dim1=1, dim2=2)[:, : H * n_u] += problem.barrier * (1 / below**2 + 1 / above**2)
-        s, S, mu = torch.cat(slacks, -1), torch.cat(slopes, 1), mu.flatten(1)
-        low, high = (v.unsqueeze(-2).expand(batch, H, n_u).flatten(1) for v in (problem.u_min, problem.u_max))
-        none = torch.zeros_like(mu)
-        low, high = torch.cat([low, none], 1), torch.cat([high, none + torch.inf], 1)
-        z = torch.cat([u.flatten(1), lam.flatten(1)], 1)
-        projected = z - (z - gradient + matvec(S.mT, mu)).clamp(low, high)
-        worst = torch.cat([projected, torch.minimum(s, mu)], 1).abs().amax(-1) / size
-        residual = torch.maximum(worst, (-s).amax(-1))
-        primal = Primal(torch.stack(x, 1), u, lam, problem.no_multipliers())
-        return cls(primal, mu, s, S, gradient, hessian, low, high, residual)
+            gradient[:, : below.shape[1]] += problem.barrier * (1 / above - 1 / below)
+            hessian.diagonal(dim1=1, dim2=2)[:, : below.shape[1]] += problem.barrier * (1 / below**2 + 1 / above**2)
+        stages = matvec(problem.batch_first("Q"), x[:, 1:-1]) + problem.batch_first("q")
+        last = matvec(problem.Q_final, x[:, -1]) + problem.q_final
+        size = torch.cat([stages, last.unsqueeze(1)], 1).abs().amax((1, 2)).clamp_min(1.0)
+        moved = (z - gradient + matvec(program.S[..., :-1].mT, mu)).clamp(*program.bounds())
+        worst = torch.cat([z - moved, torch.minimum(s, mu)], 1).abs().amax(1) / size
+        return cls(z, mu, x, s, gradient, hessian, torch.maximum(worst, (-s).amax(1)))
 
-    def newton(self, problem: MPCProblem) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute u, λ and multiplier of s ≥ 0 that solve the program if its active constraints are those here."""
-        z = torch.cat([self.primal.u.flatten(1), self.primal.lam.flatten(1)], 1)
-        in_u = self.primal.u.shape[1] * self.primal.u.shape[2]
+    def newton(self, problem: MPCProblem, program: _Program) -> tuple[Tensor, Tensor]:
+        """Compute z and the multiplier of s ≥ 0 that solve the program if its active constraints are those here."""
+        z, S, (low, high) = self.z, program.S[..., :-1], program.bounds()
         # By Newton's step of one coordinate, so that units do not decide what is active.
         h = self.hessian.diagonal(dim1=1, dim2=2).clamp_min(torch.finfo(torch.float64).tiny)
-        moved = z - (self.gradient - matvec(self.S.mT, self.mu)) / h
-        held = (moved <= self.low) | (moved >= self.high)
-        bound = torch.where(moved <= self.low, self.low, self.high)
-        touching = self.s < self.mu * (self.S.square() / h.unsqueeze(1)).sum(-1)
+        moved = z - (self.gradient - matvec(S.mT, self.mu)) / h
+        held = (moved <= low) | (moved >= high)
+        touching = self.s < self.mu * (S.square() / h.unsqueeze(1)).sum(-1)
         n, m = z.shape[1], self.s.shape[1]
         K = torch.zeros(len(z), n + m, n + m, dtype=torch.float64)
-        K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = self.hessian, -self.S.mT, self.S
+        K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = self.hessian, -S.mT, S
         right = torch.cat([-self.gradient, -self.s], 1)
         # Rows of held z give the step to its bound, those of open s a zero multiplier.
         fixed = torch.cat([held, ~touching], 1)
         K = torch.where(fixed.unsqueeze(-1), torch.eye(n + m, dtype=torch.float64), K)
-        right = torch.where(fixed, torch.cat([bound - z, torch.zeros_like(self.s)], 1), right)
+        right = torch.where(fixed, torch.cat([moved.clamp(low, high) - z, torch.zeros_like(self.s)], 1), right)
         step = torch.nan_to_num(torch.linalg.solve_ex(K, right)[0], nan=0.0, posinf=0.0, neginf=0.0)
-        u, lam = (z + step[:, :n]).split([in_u, m], 1)
-        u = u.reshape(self.primal.u.shape)
-        # With a barrier a step goes at most nine tenths of the way to a bound.
-        u = problem.clip_inside(u, self.primal.u) if problem.barrier > 0 else u
-        return u, lam.reshape(self.primal.lam.shape), step[:, n:].clamp_min(0.0)
+        new = z + step[:, :n]
+        if problem.barrier > 0:  # a step goes at most nine tenths of the way to a bound
+            u, lam = program.split(new)
+            new = torch.cat([problem.clip_inside(u, program.split(z)[0]).flatten(1), lam.flatten(1)], 1)
+        return new, step[:, n:].clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Independent judges of what the library returns. NumPy and SciPy only: nothing here imports difflcs.
+"""Independent judges of what the library returns: nothing here calls difflcs.
 
 Every judge recomputes the conditions in float64 from the RETURNED numbers and gives, per condition and element,
 violation / limit: above 1 is a broken promise, and what is not a number counts as infinite. `SINGLE` is the allowance
@@ -6,6 +6,7 @@ for results that were rounded to float32: one rounding of each term.
 """
 
 import numpy as np
+import torch
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
@@ -223,18 +224,9 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Batched solve; NaN where a matrix is singular or not finite."""
     vector = right.ndim == 2
     ok = np.isfinite(matrix).all((1, 2)) & np.isfinite(right).reshape(len(right), -1).all(1)
-    safe = np.where(ok[:, None, None], matrix, np.eye(matrix.shape[-1]))
-    full = right[..., None] if vector else right
-    try:
-        out = np.linalg.solve(safe, full)
-    except np.linalg.LinAlgError:
-        out = np.full(full.shape, np.nan)
-        for i, (m, r) in enumerate(zip(safe, full, strict=True)):
-            try:
-                out[i] = np.linalg.solve(m, r)
-            except np.linalg.LinAlgError:
-                pass
-    out = np.where(ok[:, None, None], out, np.nan)
+    safe = torch.from_numpy(np.where(ok[:, None, None], matrix, np.eye(matrix.shape[-1])))
+    out, singular = torch.linalg.solve_ex(safe, torch.from_numpy(right[..., None] if vector else right))
+    out = np.where((ok & (singular.numpy() == 0))[:, None, None], out.numpy(), np.nan)
     return out[..., 0] if vector else out
 
 
