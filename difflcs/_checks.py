@@ -216,10 +216,11 @@ def all_finite(*values: Tensor) -> bool:
     return _kernels.all_finite([(v.detach() if v.requires_grad else v).numpy() for v in values])
 
 
-def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], remedy: str = "build one first") -> R:
+def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], remedy: str = "") -> R:
     """Refuse anything but an object of a class, or of one of some classes."""
     if not isinstance(value, kind):
         wanted = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        remedy = remedy or ("give True or False" if kind is bool else "build one first")
         raise DTypeError(f"{name}: expected {wanted}, got {describe(value)}; {remedy}")
     return value
 

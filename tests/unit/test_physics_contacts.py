@@ -1,5 +1,6 @@
 """Contacts of many geoms and many states at once: those of each pair, and of each state, alone."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import mujoco
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco import MujocoLCS
+from difflcs.physics.mujoco import Distance, MujocoCost, MujocoLCS
 from difflcs.physics.mujoco.nominal import solve_soft
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
@@ -20,7 +21,7 @@ def pile(kinds=KINDS, memory="16M"):
     shape = {"mesh": 'type="mesh" mesh="m"'}
     geoms = (shape.get(kind, f'type="{kind}" size=".05 .06 .04"') for kind in kinds)
     bodies = "".join(
-        f'<body pos="{9 * i} 0 1"><freejoint/><geom {geom} mass="1"/></body>' for i, geom in enumerate(geoms)
+        f'<body name="{i}" pos="{9 * i} 0 1"><freejoint/><geom {geom} mass="1"/></body>' for i, geom in enumerate(geoms)
     )
     return mujoco.MjModel.from_xml_string(f"""<mujoco><size memory="{memory}"/>
         <asset><mesh name="m" vertex="{CUBE}"/></asset>
@@ -78,6 +79,19 @@ def test_threads_find_what_one_finds():
     for name in ("A", "B", "d"):
         each = torch.stack([getattr(s, name) for s in systems])
         torch.testing.assert_close(getattr(system, name), each, rtol=1e-5, atol=1e-5)
+
+
+def test_several_threads_may_ask_one_module():
+    """They took each other's memory, and the process crashed."""
+    module = MujocoLCS(model := pile(("box", "mesh")), contacts=8, motion="dynamic")
+    cost, x = MujocoCost(module, [Distance("body:0", "body:1")]), module.state.to_state(placed(model, 5))
+
+    def ask(state):
+        return *module.params(state).tensors().values(), *cost.at(state).tensors().values()
+
+    with ThreadPoolExecutor(4) as pool:
+        for found, expected in zip(pool.map(ask, [*x] * 10), [*map(ask, x)] * 10, strict=True):
+            assert all(map(torch.equal, found, expected))
 
 
 @pytest.mark.parametrize("threads", [1, 2])

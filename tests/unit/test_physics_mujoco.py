@@ -425,14 +425,18 @@ FLAG = SERVOS + '<option><flag {}="{}"/></option>'
 SINCE_MUJOCO_4 = hasattr(mujoco.MjModel, "nhistory")
 # What stands beside the servos of a box and its pusher, the options, and what the error says.
 RESTS = {
-    "a group of actuators that is disabled": (SERVOS + '<option actuatorgroupdisable="0"/>', {}, "not disabled"),
+    "a group of actuators that is disabled": (
+        SERVOS + '<option actuatorgroupdisable="0"/>',
+        {},
+        "not disabled.* got actuator 0, actuator 1; rem",
+    ),
     "actuators that a flag disables": (FLAG.format("actuation", "disable"), {}, "not disabled"),
     "friction of two kinds": (SERVOS + PAIR, {}, "got 1 and 0.1 between geoms 'block' and 'tip'"),
     "friction by override": (SERVOS + OVERRIDE, {}, "got 0.9 and 0.8"),
     "adhesion": (
         SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>'),
         {"motion": "dynamic"},
-        "adhesion",
+        "no <adhesion>, .* got actuator 2; remove or",
     ),
     "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
     "no actuators": ("", {}, "actuators"),
@@ -445,6 +449,12 @@ RESTS = {
     "negative friction": (SERVOS, {"friction": -1.0}, "friction"),
     "no compliance": (SERVOS, {"compliance": 0.0}, "compliance"),
     "no contacts": (SERVOS, {"contacts": 0}, "contacts"),
+    "contacts that fit into no memory": (SERVOS, {"contacts": 10**6}, "contacts: expected at most 1000"),
+    "a step of years": (
+        SERVOS,
+        {"motion": "dynamic", "seconds": 1e9},
+        "time steps of the model: expected at most 100000",
+    ),
 }
 if SINCE_MUJOCO_4:
     RESTS["delay of an actuator"] = (SERVOS.replace("/></", ' delay=".05" nsample="20"/></'), {}, "no delay of actu")
@@ -467,7 +477,7 @@ def test_what_a_system_does_not_have_is_refused(case):
 PUSHING = pushing()
 REFUSED = [  # calls, errors, and what these say
     (lambda: MujocoLCS(PUSHING, pairs=1.5), DTypeError, "pairs: expected a list, got float"),
-    (lambda: MujocoLCS(PUSHING, relative="no"), DTypeError, "relative: expected bool"),
+    (lambda: MujocoLCS(PUSHING, relative="no"), DTypeError, "relative: expected bool, got str 'no'; give True"),
     (lambda: MujocoLCS(PUSHING, motion="dynamic").states_along(None, None), DTypeError, "x: expected a torch.Tensor"),
     (lambda: at(load(SPHERE), 0, 0, 0, 0, 2 * np.pi, motion="dynamic"), InvalidInputError,
      "near a whole turn .* got 6.28319 rad in joint0_rx .* state 1; .* or move the reference"),

@@ -11,7 +11,7 @@ import torch
 
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import InvalidInputError
-from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS
+from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoCost, MujocoLCS, Posture
 from tests.conftest import F64, refuse
 
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
@@ -177,3 +177,9 @@ def test_transforms_of_torch_func_map_what_is_learned_and_are_refused_by_fixed_p
     torch.testing.assert_close(torch.vmap(lambda v: module.params(v).A)(x), module.params(x).A)
     for ask in (module.physics.params, module.action_bounds):
         refuse(InvalidInputError, "inside a transform", torch.vmap(ask), x)
+    cost, goal = MujocoCost(module.physics, [Posture(["push"])]), torch.zeros(2, 1).double()
+    for where in (torch.func.vmap(cost.at, (None, 0)), torch.func.grad(lambda x, to: cost.at(x, to).q.sum(), 1)):
+        refuse(InvalidInputError, "inside a transform", where, x[0], goal)
+    refuse(InvalidInputError, "inside a transform", torch.func.grad(lambda to: module.physics.params(x).d.sum()), goal)
+    fixed = MujocoLCS(scene(), motion="dynamic", **OPTIONS)  # what is not mapped has numbers
+    torch.testing.assert_close(torch.vmap(lambda to: fixed.params(x[0]).d + to)(goal)[0], fixed.params(x[0]).d)

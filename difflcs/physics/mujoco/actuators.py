@@ -10,7 +10,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_kind, check_tensor
 from difflcs.errors import InvalidInputError, ShapeError
-from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.native import flags, to_numpy
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ class Actuators:
                 f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
                 f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
             )
-        return ctrl.detach().double().cpu().expand(*batch, len(self.dof)).numpy()
+        return to_numpy(ctrl.expand(*batch, len(self.dof)))
 
     def _length(self, x: Array) -> Array:
         """Length (..., nu) of actuators on joints, or its rate, from positions or velocities that x begins with."""
@@ -236,27 +236,27 @@ def check_model(model: Any, data: Any, motion: str) -> None:
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
     dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
-    refused = {
-        "joints, as nothing moves without": not model.nv,
-        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
-        != model.nu,
-        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
-            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
+
+    def actuators(those: Any) -> str:
+        return ", ".join(f"actuator {model.actuator(i).name or i!r}" for i in np.flatnonzero(those).tolist())[:200]
+
+    controls, delays, yields = (getattr(model, name, 0) for name in ("nactuator", "nhistory", "nplastic"))
+    refused = {  # what is wanted, and what there is instead
+        "joints, as nothing moves without": not model.nv and "none",
+        "one control for each actuator, not those of <pid> and <orientation>": controls not in (0, model.nu) and "more",
+        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": actuators(
+            ~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)
         ),
-        "no <adhesion>, whose force depends on what is in contact": bool(
-            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+        "no <adhesion>, whose force depends on what is in contact": actuators(
+            model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)
         ),
-        "rigid bodies, no <flex>": bool(model.nflex),
-        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
-            getattr(model, "nhistory", 0)
-        ),
-        "springs that do not yield (springyield), which would need their rest lengths as states": bool(
-            getattr(model, "nplastic", 0)
-        ),
-        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
+        "rigid bodies, no <flex>": model.nflex and f"{model.nflex} of these",
+        "no delay of actuators and sensors (delay, nsample), which would need their past as states": delays and "some",
+        "springs that do not yield (springyield), which would need their rest lengths as states": yields and "others",
+        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': model.opt.enableflags & _SLEEP and "it",
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
-        "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
+        "what they drive": actuators(disabled_actuators(model) & (motion == "quasi-static")),
     }
     for wanted, present in refused.items():
         if present:
-            raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+            raise InvalidInputError(f"model: expected {wanted}, got {present}; remove or replace it in the model")

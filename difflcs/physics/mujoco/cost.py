@@ -27,6 +27,7 @@ from difflcs._fields import TensorFields, register
 from difflcs.cost import QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco.lcs import MujocoLCS
+from difflcs.physics.mujoco.native import in_turn, to_numpy
 from difflcs.physics.mujoco.state import cross
 
 Weight = float | Sequence[float] | Tensor
@@ -181,7 +182,8 @@ class MujocoCost(TensorFields):
                     weights[at] = weight
         register(self, "weights", torch.from_numpy(weights))
         kinds = np.array([row.kind for row in rows for _ in range(row.size)], int)
-        self._squares, self._efforts = np.flatnonzero(kinds != _EFFORT), np.flatnonzero(kinds == _EFFORT)
+        self._squares, efforts = np.flatnonzero(kinds != _EFFORT), np.flatnonzero(kinds == _EFFORT)
+        self._efforts = efforts.reshape(sum(row.kind == _EFFORT for row in rows), self.n_u)
         self._rows = [row for row in rows if row.kind != _EFFORT]
         self.n_goal = sum(row.n_goal for row in self._rows if row.goal is None)
         self.constant = not (self.n_goal or self._scene.frames)
@@ -196,12 +198,12 @@ class MujocoCost(TensorFields):
         given = [value.to("cpu", torch.float64) for value in given]
         learns = torch.is_grad_enabled() and any(value.requires_grad for value in given)
         of: Any = torch if learns else np  # the formulas below are those of both; NumPy takes a third of the time
-        arrays: list[Any] = given if learns else [value.detach().numpy() for value in given]
+        arrays: list[Any] = given if learns else [to_numpy(value) for value in given]
         weights, *others = arrays
         weights = weights + 0  # a copy
         for (_, at), value in zip(self._learned, others, strict=False):
             weights[at] = value
-        weight, effort = weights[:, self._squares], weights[0, self._efforts].reshape(-1, self.n_u).sum(0)
+        weight, effort = weights[:, self._squares], weights[0, self._efforts].sum(0)
         A, offset, turns = self._scene.read(x, self._rows)
         if learns:
             A, offset, turns = map(torch.from_numpy, (A, offset, turns))
@@ -355,6 +357,10 @@ class _Scene:
         self._data = mujoco.MjData(self._model)
         self.frames: list[tuple[str, int]] = []
 
+    @property
+    def _turns(self) -> Any:
+        return self._module._turns
+
     def bind(self, about: str, term: Term) -> _Row:
         """Find what a term is about."""
         if isinstance(term, Effort):
@@ -408,6 +414,7 @@ class _Scene:
                 raise _unknown(about, "joint" if turning else "slide or hinge", known, name)
         return [dof for name in names for dof in known[name]]
 
+    @in_turn
     def read(self, x: Tensor, rows: Sequence[_Row]) -> tuple[Any, Any, Any]:
         """Read rows at states x (..., n_x).
 
@@ -417,7 +424,7 @@ class _Scene:
         """
         state, model, data, source = self._module.state, self._model, self._data, self._module._data
         qpos = state.to_mujoco(x)[0].reshape(-1, state.nq)
-        flat, nv, n, count = x.detach().double().cpu().numpy(), state.nv, len(qpos), len(self.frames)
+        flat, nv, n, count = to_numpy(x), state.nv, len(qpos), len(self.frames)
         batch, flat = flat.shape[:-1], flat.reshape(n, flat.shape[-1])
         place, turn, moves = np.empty((n, count, 3)), np.empty((n, count, 9)), np.empty((n, count, 2, 3, nv))
         turns, turning = np.zeros((n, count, 4)), {row.where[0] for row in rows if row.kind == _TURN}

@@ -11,6 +11,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.contacts import Budget, check_pair, find_geoms
 
 Array = NDArray[np.float64]
+_MOST = 1000  # contacts, whose matrices have a gigabyte and more
 
 
 class ContactGroup(NamedTuple):
@@ -42,7 +43,7 @@ def find_budgets(
         distance: of the module [m].
     """
     if not isinstance(contacts, Sequence):
-        return None if contacts is None else check_positive_int("contacts", contacts)
+        return None if contacts is None else check_positive_int("contacts", contacts, maximum=_MOST)
     if not contacts or not all(isinstance(group, ContactGroup) for group in contacts):
         raise InvalidInputError(
             f"contacts: expected a number, or a list of ContactGroup, got {describe(contacts)}; give one at least"
@@ -59,9 +60,9 @@ def find_budgets(
     return [
         Budget(
             number == i,
-            check_positive_int("contacts of a group", group.contacts),
+            check_positive_int("contacts of a group", group.contacts, maximum=_MOST),
             distance if group.distance is None else check_number("distance of a group", group.distance, strict=True),
-            check_kind("friction of a group", group.friction, bool, "give True or False"),
+            check_kind("friction of a group", group.friction, bool),
         )
         for i, group in enumerate(contacts)
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -38,7 +39,7 @@ from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
-from difflcs.physics.mujoco.native import check_readable, flags, native, take_given, taken
+from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
 from difflcs.physics.mujoco.nominal import Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
@@ -70,7 +71,7 @@ class MujocoLCS:
     Not in the system, with a `ContactWarning`: rolling friction, surfaces that move or stick. Refused: <adhesion>,
     delay, sleep, springs that yield, height fields and signed distance fields that may touch something, friction that
     differs by direction; in quasi-static motion disabled actuators. The matrices carry no gradient of the state. An
-    object keeps one private copy of the model and its data, so use it from one thread at a time.
+    object keeps one private copy of the model and its data, which several threads use in turn.
 
     Args:
         model: the MuJoCo model.
@@ -134,7 +135,7 @@ class MujocoLCS:
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
         self.compliance = check_number("compliance", compliance, strict=True)
-        model = copy.copy(model)
+        model, self._turns = copy.copy(model), threading.RLock()
         disabled = int(model.opt.disableflags)
         model.opt.disableflags |= flags("AUTORESET")  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
@@ -164,6 +165,8 @@ class MujocoLCS:
         budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
+        random = torch.Generator().manual_seed(0)
+        self._between = torch.rand(_BETWEEN, 1, model.nu, generator=random, dtype=torch.float64)
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
@@ -199,6 +202,7 @@ class MujocoLCS:
         smooth = self.n_contacts - rough
         return count_forces(rough, self._finder.n_tangents, self.cone, smooth + rows.n_limits, rows.n_friction)
 
+    @in_turn
     def observe(self, data: Any) -> Tensor:
         """Return the state (n_x,) of MuJoCo's data, and let rotations count from the orientations there from now on.
 
@@ -215,6 +219,7 @@ class MujocoLCS:
         self.state.follow(data.qpos)
         return self.state.to_state(data.qpos, data.qvel, data.act)
 
+    @in_turn
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x).
 
@@ -279,6 +284,7 @@ class MujocoLCS:
         """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
         return context if self._quasi_static else self.control(x, u)
 
+    @in_turn
     def states_along(self, x: Tensor, u: Tensor) -> Tensor | None:
         """Simulate the states (..., H, n_x) at which actions u (..., H, n_u) of a plan begin, from x (..., n_x).
 
@@ -286,6 +292,7 @@ class MujocoLCS:
         """
         return None if self._whole is None else self._whole.follow(self._places, self.state, self.control, x, u)
 
+    @in_turn
     def contacts(self, x: Tensor) -> Contacts:
         """Compute gaps and their derivatives at states x (..., n_x); a missing contact has `distance` and zeros."""
         read = self._read(x)
@@ -312,8 +319,7 @@ class MujocoLCS:
             x: (..., n_x) states.
         """
         check_tensor("x", x, [("n_x", self.n_x)])
-        check_readable(x)
-        numbers = x.detach().double().cpu().numpy()
+        numbers = to_numpy(x)
         if self._quasi_static:
             bounds = self._actuators.places(numbers)
         else:
@@ -325,7 +331,7 @@ class MujocoLCS:
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
-        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
+        flat = to_numpy(x).reshape(n, self.n_x)
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
@@ -431,7 +437,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
-    parts = torch.rand(_BETWEEN, 1, of.n_u, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    parts = of._between.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
     turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
     u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*of.action_bounds(x))

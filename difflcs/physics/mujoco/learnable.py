@@ -16,7 +16,7 @@ from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.lcs import MujocoLCS
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, ELLIPSOID, SPHERE
-from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.native import flags, to_numpy
 from difflcs.physics.mujoco.quasi_dynamic import BIASES, GAINS
 from difflcs.records import SYSTEM, LCSParams
 
@@ -161,11 +161,11 @@ class LearnableMujocoLCS(nn.Module):
     @property
     def physics(self) -> MujocoLCS:
         """The physics as it is learned by now."""
-        return self._build(fresh(self, ("change",)).change.detach().cpu().double().numpy(), keep=True)
+        return self._build(to_numpy(fresh(self, ("change",)).change), keep=True)
 
     def mujoco_model(self) -> Any:
         """Return a copy of MuJoCo's model with what is learned, but for the compliance."""
-        return self._changed(self.change.detach().cpu().double().numpy())
+        return self._changed(to_numpy(self.change))
 
     def observe(self, data: Any) -> Tensor:
         """See `MujocoLCS.observe`."""
@@ -242,8 +242,9 @@ class LearnableMujocoLCS(nn.Module):
     def _build(self, change: Array, keep: bool = False) -> MujocoLCS:
         """Make the physics of some parameters; the last one that was kept is at hand."""
         key = change.tobytes()
-        if self._built[0] == key:
-            return self._built[1]
+        kept = self._built  # once: another thread may keep something else
+        if kept[0] == key:
+            return kept[1]
         factors = {e.kind: float(np.exp(change[e.start])) for e in self._entries if e.kind == "compliance"}
         compliance = self._options["compliance"] * factors.get("compliance", 1.0)
         built = MujocoLCS(self._changed(change), self._data, **{**self._options, "compliance": compliance})

@@ -26,6 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
@@ -38,6 +39,7 @@ Array = NDArray[np.float64]
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
 _FAST_MOTION = 100.0  # a motion in a step [m, rad] or velocity that may be that of unstable steps
 _FINER = 4  # how many steps for one of MuJoCo's where these are unstable
+_LONGEST = 100_000  # time steps in one step of the system, far more than any plan is for
 _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and later
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}", -1))
@@ -153,7 +155,9 @@ class Dynamic:
         self.relative = np.flatnonzero(actuators.servo) if relative else np.zeros(0, dtype=np.intp)
         self.moment = np.zeros((model.nu, model.nv))
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
-        self.steps = Steps(max(1, round(seconds / model.opt.timestep)), int(model.opt.integrator))
+        count = max(1, round(seconds / model.opt.timestep))
+        check_positive_int("seconds, in time steps of the model", count, maximum=_LONGEST)
+        self.steps = Steps(count, int(model.opt.integrator))
         coarse = self.steps.integrator if self.steps.integrator in (_RK4, _DISCRETE) else _IMPLICIT
         self.simulated = self.steps if self.steps.count <= _MOST or model.neq else Steps(_FEW, coarse)
         damped = not model.opt.disableflags & flags("EULERDAMP")

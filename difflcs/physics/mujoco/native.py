@@ -1,9 +1,10 @@
 """MuJoCo's errors, and the warnings that it only counts, as exceptions of this library; bits of its flags."""
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from difflcs._differentiation import is_wrapped
 from difflcs.errors import InvalidInputError, NonFiniteError
 
+P, R, Array = ParamSpec("P"), TypeVar("R"), NDArray[np.float64]
 TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
 """Fields of a caller's data that are used besides the state."""
 
@@ -34,17 +36,29 @@ _WARNINGS = {
 }
 
 
-def check_readable(x: Tensor) -> None:
-    """Refuse states inside `torch.func.vmap` and the like, whose numbers nobody can read.
+def to_numpy(tensor: Tensor) -> Array:
+    """Read the numbers of states, goals or parameters.
 
     Raises:
-        InvalidInputError: they are.
+        InvalidInputError: they are inside `torch.func.vmap`, `grad` and the like, where nobody can read them.
     """
-    if is_wrapped(x):
+    if is_wrapped(tensor := tensor.detach()):
         raise InvalidInputError(
-            "x: expected states whose numbers can be read, got some inside a transform of torch.func; pass batches "
-            "(..., n_x), and differentiate by backward"
+            "x: expected states and goals whose numbers can be read, got some inside a transform of torch.func; pass "
+            "batches (..., n_x), and differentiate by backward"
         )
+    return tensor.cpu().double().numpy()
+
+
+def in_turn(method: Callable[P, R]) -> Callable[P, R]:
+    """Let one thread after the other into methods of an object with `_turns`, a lock: MuJoCo's data are its own."""
+
+    @functools.wraps(method)
+    def alone(*args: P.args, **options: P.kwargs) -> R:
+        with args[0]._turns:  # pyright: ignore[reportAttributeAccessIssue]
+            return method(*args, **options)
+
+    return alone
 
 
 def flags(*names: str) -> int:
@@ -78,7 +92,6 @@ def take_given(into: Any, data: Any) -> None:
         field[:] = values
 
 
-Array = NDArray[np.float64]
 _KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text in _WARNINGS.items()}
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from difflcs._checks import check_array, check_kind, check_shape, check_tensor
 from difflcs.errors import InvalidInputError, ShapeError
-from difflcs.physics.mujoco.native import check_readable
+from difflcs.physics.mujoco.native import to_numpy
 
 Array = NDArray[np.float64]
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # a factor that makes it of a quaternion
@@ -142,8 +142,7 @@ class MujocoState:
             DTypeError, ShapeError, NonFiniteError: not such states.
         """
         check_tensor("x", x, [("n_x", self.n_x)])
-        check_readable(x)
-        numbers = x.detach().double().cpu().numpy()
+        numbers = to_numpy(x)
         qpos = self._references(numbers.shape[:-1]).copy()
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
@@ -159,7 +158,7 @@ class MujocoState:
         """Convert states (..., n_x) to MuJoCo's (n, nq + nv + na); of states without velocities `act` (na,) is that."""
         (qpos, qvel), n = self.to_mujoco(x), x.shape[:-1].numel()
         if self.na:
-            act = x.detach().double().cpu().numpy()[..., self.n_x - self.na :].reshape(n, self.na)
+            act = to_numpy(x)[..., self.n_x - self.na :].reshape(n, self.na)
         else:
             act = act[None].repeat(n, 0)
         return np.concatenate([qpos.reshape(n, self.nq), qvel.reshape(n, self.nv), act], -1)
