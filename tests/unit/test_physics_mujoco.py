@@ -55,8 +55,7 @@ def step(model, qpos, qvel=0.0, ctrl=0.0, seconds=0.1):
     """What MuJoCo does."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
-    for _ in range(round(seconds / model.opt.timestep)):
-        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
     return data.qpos.copy(), data.qvel.copy()
 
 
@@ -69,12 +68,8 @@ def many_joints():
 
 
 def random_state(model, seed):
-    random = np.random.default_rng(seed)
-    qpos = np.zeros(model.nq)
-    mujoco.mj_integratePos(model, model.qpos0.copy(), random.normal(size=model.nv), 1.0)
-    start = model.qpos0.copy()
-    mujoco.mj_integratePos(model, start, random.normal(size=model.nv) * 0.8, 1.0)
-    qpos[:] = start
+    random, qpos = np.random.default_rng(seed), model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, random.normal(size=model.nv) * 0.8, 1.0)
     return qpos, random.normal(size=model.nv)
 
 

@@ -35,6 +35,7 @@ _JAMS = 30.0  # times what there is to move: forces of contacts that press again
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
+_SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly where no robot presses them; up to twice, in part
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -129,10 +130,11 @@ def correct(
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
     motion = size(speed) + np.minimum(size(free), _HELD * (size(speed) + size(change)))
     worse = (size(wrong) - size(change)) / (_WORSE * motion + 1e-9)
+    slight = (2 - size(wrong) / (_SLIGHT * motion + 1e-9)) * (not step.motion.firm.any())
     share = energy[:, :, :n_contacts].sum(-1) / total
     # What contacts jam stands with any action.
     pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (size(speed) + size(free)), 1e-300))
-    counts = 1 - share / pressed * (1 - np.clip(worse, 0.0, 1.0))
+    counts = 1 - share / pressed * (1 - np.clip(np.maximum(worse, slight), 0.0, 1.0))
     moves = size(speed) + size(change)
     least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
     doubtful = (size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)

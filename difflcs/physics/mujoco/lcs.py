@@ -163,7 +163,7 @@ class MujocoLCS:
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
         budgets = find_budgets(model, contacts, distance)
-        plain = motion == "dynamic" and pairs is None and friction is None
+        plain = motion == "dynamic" and pairs is None and friction is None and torsion
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
         random = torch.Generator().manual_seed(0)
         self._between = torch.rand(_BETWEEN, 1, model.nu, generator=random, dtype=torch.float64)
