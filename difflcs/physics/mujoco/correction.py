@@ -35,7 +35,7 @@ _JAMS = 30.0  # times what there is to move: forces of contacts that press again
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
-_SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly where no robot presses them; up to twice, in part
+_SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
