@@ -49,6 +49,7 @@ def test_this_machine(checks):
     assert {check.status for check in checks} <= {"ok", "missing", "failed"}
     assert all(check.text for check in checks)
     assert all(check.remedy for check in checks if check.status == "missing")
+    assert 0 < float(re.findall(r"([\d.]+) ms", found["batched"].text)[0]) < 60_000
 
 
 def test_the_environments_are_tried(checks):
@@ -79,11 +80,13 @@ def test_a_broken_core_is_exit_code_1(capsys, monkeypatch, versions, error):
 
     versions.update(mujoco=None)  # the environments are not tried
     monkeypatch.setattr(doctor, "solve_lcp", fail)
+    monkeypatch.setenv("COLUMNS", "68")  # where the remedy would break at a hyphen
     assert cli.main(["doctor"]) == 1
     text = capsys.readouterr().out
     assert "!!  kernels" in text
     assert "does NOT work" in text
     assert str(error) in text
+    assert isinstance(error, RuntimeError) or "--force-reinstall" in text
 
 
 def test_missing_extras_are_no_failure_and_say_what_to_install(versions):

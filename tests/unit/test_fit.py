@@ -30,6 +30,7 @@ def test_the_system_that_made_the_data_has_no_error_and_needs_every_contact():
         assert torch.equal(report.gain > 1e-12, lam > 1e-9)  # each force explains the data in which it acts
         assert report.rollout[:15, 0].max() < 1e-9
         assert report.rollout[15].isnan().all()  # no episode has 16 steps
+    assert str(report).splitlines()[4].split()[2:] == ["0.000", f"{report.linear[3]:.3f}"]
     assert "acts in" in str(report)
     assert len(report.plot().axes) == 3
 

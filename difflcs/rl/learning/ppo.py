@@ -127,13 +127,8 @@ class PPO(Trainer):
         surrogate: the loss.
         update: the rule that moves the policy.
         scale: rewards to learn from.
-        seed: of noise, value network, goals and initial states.
-        features: inputs of the value network.
+        seed, features, total_episodes, episode_steps, first_episode, first_iteration: see `make_ppo`.
         rollouts: episodes per iteration.
-        total_episodes: episodes of the whole training; the main phase ends there.
-        episode_steps: steps of one episode.
-        first_episode: episodes collected before, by a warm-up.
-        first_iteration: iterations done before.
         max_kl: KL divergence at which an iteration ends early.
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks, besides the robot's own; None: real episodes alone, as in the paper.
