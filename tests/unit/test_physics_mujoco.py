@@ -445,11 +445,7 @@ RESTS = {
     "no compliance": (SERVOS, {"compliance": 0.0}, "compliance"),
     "no contacts": (SERVOS, {"contacts": 0}, "contacts"),
     "contacts that fit into no memory": (SERVOS, {"contacts": 10**6}, "contacts: expected at most 1000"),
-    "a step of years": (
-        SERVOS,
-        {"motion": "dynamic", "seconds": 1e9},
-        "time steps of the model: expected at most 100000",
-    ),
+    "a step of years": (SERVOS, {"motion": "dynamic", "seconds": 1e9}, "time steps: expected at most 100000"),
 }
 if SINCE_MUJOCO_4:
     RESTS["delay of an actuator"] = (SERVOS.replace("/></", ' delay=".05" nsample="20"/></'), {}, "no delay of actu")

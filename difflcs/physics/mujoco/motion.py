@@ -155,8 +155,7 @@ class Dynamic:
         self.relative = np.flatnonzero(actuators.servo) if relative else np.zeros(0, dtype=np.intp)
         self.moment = np.zeros((model.nu, model.nv))
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
-        count = max(1, round(seconds / model.opt.timestep))
-        check_positive_int("seconds, in time steps of the model", count, maximum=_LONGEST)
+        count = check_positive_int("seconds, in time steps", max(1, round(seconds / model.opt.timestep)), 1, _LONGEST)
         self.steps = Steps(count, int(model.opt.integrator))
         coarse = self.steps.integrator if self.steps.integrator in (_RK4, _DISCRETE) else _IMPLICIT
         self.simulated = self.steps if self.steps.count <= _MOST or model.neq else Steps(_FEW, coarse)
