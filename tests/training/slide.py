@@ -128,30 +128,23 @@ def small_settings(**changes: Any) -> PPOSettings:
     return replace(PPOSettings(rollouts=ROLLOUTS, steps=4, std=0.03, critic=critic, gain=None), **changes)
 
 
-def slide_actor(settings: PPOSettings, lcs: LCSModel | None = None) -> GaussianPolicy:
-    return make_actor(make_mpc(make_model() if lcs is None else lcs), settings.std, settings.covariance)
-
-
 def make_ppo(
     seed: int = 0,
     iterations: int = 4,
     env: SyncVectorEnv | None = None,
     models: ModelRollouts | None = None,
     penalty: float = PENALTY,
+    controller: LCSMPCLayer | None = None,
+    options: dict[str, Any] | None = None,
     **changes: Any,
 ) -> PPO:
+    """PPO with other settings where `changes` has them, and other arguments where `options` has them."""
     settings = small_settings(**changes)
-    return ppo_settings.make_ppo(
-        slide_actor(settings),
-        make_envs(penalty=penalty) if env is None else env,
-        settings,
-        seed,
-        features=features,
-        total_episodes=iterations * ROLLOUTS,
-        episode_steps=STEPS,
-        failure_penalty=penalty,
-        models=models,
-    )
+    usual = {"features": features, "total_episodes": iterations * settings.rollouts, "failure_penalty": penalty}
+    options = {**usual, "episode_steps": STEPS, "models": models, **(options or {})}
+    actor = make_actor(controller or make_mpc(make_model()), settings.std, settings.covariance)
+    env = make_envs(settings.rollouts, penalty=penalty) if env is None else env
+    return ppo_settings.make_ppo(actor, env, settings, seed, **options)
 
 
 def make_models(seed: int = 0, first_epochs: int = 20, **changes: Any) -> ModelRollouts:

@@ -35,17 +35,9 @@ def features(state, goal, elapsed, context):
 
 
 def make_trainer(lcs: Any, iterations: int = 4, **changes: Any) -> PPO:
-    settings = slide.small_settings(**{"violation": LOSS, **changes})
-    return make_ppo(
-        make_actor(slide.make_mpc(lcs), settings.std, settings.covariance),
-        make_envs(settings.rollouts),
-        settings,
-        0,
-        features=features,
-        total_episodes=iterations * settings.rollouts,
-        episode_steps=STEPS,
-        failure_penalty=slide.PENALTY,
-    )
+    options = {"features": features}
+    changes = {"controller": slide.make_mpc(lcs), "violation": LOSS, **changes}
+    return slide.make_ppo(0, iterations, make_envs(slide.ROLLOUTS), options=options, **changes)
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------

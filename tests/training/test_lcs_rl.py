@@ -1,22 +1,20 @@
 """LCS-RL: the warm-up and the main phase as one trainer, on a small pushing system that needs no simulator."""
 
+import torch
+
 from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
-from difflcs.rl.learning import ppo_settings
-from difflcs.rl.learning.policy import make_actor
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.learning.state_tree import copy_state
 from tests.training.slide import (
-    PENALTY,
     ROLLOUTS,
     STEPS,
-    features,
     make_envs,
     make_model,
     make_models,
     make_mpc,
+    make_ppo,
     parameters,
     same,
-    small_settings,
 )
 
 
@@ -26,22 +24,11 @@ def make_lcsrl(seed: int = 0, models: bool = False, **changes) -> LCSRL:
     settings = WarmupSettings(rollouts=Rollouts(first=2, each=3), noise=0.02, epochs=Epochs(3, 2, 8))
     warmup, envs = Warmup(lcs, mpc, make_envs(3), settings, seed, STEPS), make_envs()
 
-    ppo = small_settings(**changes)
-
     def make_main(first_episode: int, first_iteration: int) -> PPO:
-        return ppo_settings.make_ppo(
-            make_actor(mpc, ppo.std, ppo.covariance),
-            envs,
-            ppo,
-            seed,
-            features=features,
-            total_episodes=8 + 2 * ROLLOUTS,
-            episode_steps=STEPS,
-            first_episode=first_episode,
-            first_iteration=first_iteration,
-            failure_penalty=PENALTY,
-            models=make_models(seed, 2, iterations=1, rollouts=5) if models else None,
-        )
+        options = {"first_episode": first_episode, "first_iteration": first_iteration}
+        options["total_episodes"] = 8 + 2 * ROLLOUTS
+        rollouts = make_models(seed, 2, iterations=1, rollouts=5) if models else None
+        return make_ppo(seed, env=envs, models=rollouts, controller=mpc, options=options, **changes)
 
     return LCSRL(warmup, 8 * STEPS, make_main)
 
@@ -91,3 +78,17 @@ def test_the_main_phase_remembers_the_warm_up():
     assert len(trainer.current.models) == 8
     trainer.step()
     assert len(trainer.current.models) == 8 + ROLLOUTS
+
+
+def test_what_is_handed_out_is_bounded_on_states_of_the_warm_up():
+    """Inside its episodes: PPO takes no step on these states, and model rollouts do not start there."""
+    trainer, seen = make_lcsrl(models=True, gain=-3.0), []
+    for _ in range(3):
+        trainer.step()
+    inside, incumbent = trainer.current.models.episodes["state"][:, 1:].unique(), trainer.current.incumbent
+    follow = incumbent.follow
+    incumbent.follow = lambda model, held_out: (seen.append(held_out), follow(model, held_out))
+    for _ in range(2):
+        trainer.step()
+    assert all(bool(torch.isin(one["state"], inside).all()) for one in seen)
+    assert len(seen[0]["state"].unique()) == len(inside)

@@ -6,7 +6,6 @@ from gymnasium.vector import SyncVectorEnv
 
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl import CriticSettings, Epochs, Natural
-from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.runs.evaluate import evaluate
@@ -24,8 +23,6 @@ from tests.training.slide import (
     parameters,
     recorded,
     same,
-    slide_actor,
-    small_settings,
 )
 
 
@@ -33,11 +30,7 @@ def test_ppo_learns():
     """From a model whose MPC hardly moves to one that reaches its goals."""
     env = make_envs(40)
     critic = CriticSettings(epochs=Epochs(first=60, each=3, minibatch=256))
-    settings = small_settings(rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, critic=critic)
-    trainer = ppo_settings.make_ppo(
-        slide_actor(settings), env, settings, 0, features=features, total_episodes=320, episode_steps=STEPS,
-        failure_penalty=10.0,
-    )  # fmt: skip
+    trainer = make_ppo(0, 8, env, rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, critic=critic)
     before = evaluate(env, trainer.policy, 60, 0, STEPS).success_rate
     reports = []
     while not trainer.done:
@@ -54,11 +47,7 @@ def test_ppo_learns():
 
 def test_a_start_is_replaced_by_what_is_better_and_by_nothing_else():
     """What is handed out is the start, then what played when it was accepted; the learner goes its own way."""
-    settings = small_settings(rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, gain=1.65)
-    trainer = ppo_settings.make_ppo(
-        slide_actor(settings), make_envs(40), settings, 0, features=features, total_episodes=200, episode_steps=STEPS,
-        failure_penalty=10.0,
-    )  # fmt: skip
+    trainer = make_ppo(0, 5, rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, gain=1.65)
     expected, accepted = parameters(trainer), []
     while not trainer.done:
         playing = [value.clone() for value in trainer.actor.learned.state_dict().values()]
@@ -178,12 +167,8 @@ def test_steps_left_out_are_counted():
 
 
 def test_the_budget_is_met_exactly():
-    settings = small_settings()
     for total in (ROLLOUTS - 5, 2 * ROLLOUTS + 1, 3 * ROLLOUTS):
-        trainer = ppo_settings.make_ppo(
-            slide_actor(settings), make_envs(), settings, 0, features=features, total_episodes=total + 7,
-            episode_steps=STEPS, first_episode=7,
-        )  # fmt: skip
+        trainer = make_ppo(options={"total_episodes": total + 7, "first_episode": 7})
         assert sum(trainer.sizes) == total
         assert max(trainer.sizes) <= ROLLOUTS
         assert max(trainer.sizes) - min(trainer.sizes) <= 1

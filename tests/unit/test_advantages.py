@@ -73,7 +73,7 @@ def some(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_advantages_are_the_papers():
+def test_advantages_are_the_papers(monkeypatch):
     """Eq. 5 written out, with a value of zero at the end of an episode."""
     critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
     value = critic.network(inputs.float()).detach().double().squeeze(-1)
@@ -82,11 +82,14 @@ def test_advantages_are_the_papers():
     expected = torch.zeros(5, STEPS, dtype=torch.float64)
     for t in range(STEPS):
         expected[:, t] = sum((0.9 * 0.8) ** k * delta[:, t + k] for k in range(STEPS - t))
-    found = critic.gae(inputs, rewards)
-    torch.testing.assert_close(found.advantages, expected, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(found.targets, expected + value[:, :-1], rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(found.values, value[:, :-1], rtol=1e-5, atol=1e-5)
-    assert not found.advantages.requires_grad
+    values, advantages = critic.gae(inputs, rewards)
+    torch.testing.assert_close(advantages, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(values, value[:, :-1], rtol=1e-5, atol=1e-5)
+    assert not advantages.requires_grad
+    fitted = []
+    monkeypatch.setattr(critic, "_fit", lambda seen, targets, *_: fitted.append(targets))
+    critic.learn(inputs, rewards, (0,), 1)
+    torch.testing.assert_close(fitted[0], expected + value[:, :-1], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(returns(rewards, 0.9)[:, 0], sum(0.9**k * rewards[:, k] for k in range(STEPS)))
     torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
 

@@ -1,13 +1,14 @@
 """A policy is replaced only by what did better, as far as few episodes can tell."""
 
-from types import SimpleNamespace
-
+import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
-from difflcs.rl.learning.incumbent import ITERATIONS, Incumbent, is_better
+from difflcs.rl.learning.incumbent import ITERATIONS, REACH, Incumbent, is_better
 
 F64 = torch.float64
+SEEN = TensorDict({"state": torch.linspace(-1, 1, 9, dtype=F64).unsqueeze(-1)}, [9])
 
 
 def drawn(seed, count, mean=0.0, failing=0):
@@ -17,10 +18,25 @@ def drawn(seed, count, mean=0.0, failing=0):
     return values
 
 
+def nothing(inputs):
+    """What a value network expects that knows nothing."""
+    return torch.zeros(len(inputs), dtype=F64)
+
+
+class Line:
+    """A policy that is a line, with noise of one."""
+
+    def __init__(self):
+        self.learned = nn.Linear(1, 1, dtype=F64)
+
+    def solve(self, data):
+        data["loc"], data["scale_tril"] = self.learned(data["state"]), torch.ones(*data.shape, 1, 1, dtype=F64)
+        return data
+
+
 def make(failure, errors=1.65):
     """A line that is handed out, and another one that learns."""
-    best, learner = (SimpleNamespace(controller=None, learned=nn.Linear(1, 1)) for _ in range(2))
-    return Incumbent(best, learner, failure, errors, 1)  # pyright: ignore
+    return Incumbent(Line(), Line(), failure, errors, 1)  # pyright: ignore
 
 
 def test_a_better_policy_passes_and_what_is_as_good_rarely_does():
@@ -51,22 +67,19 @@ def test_starts_are_judged_by_what_was_expected_of_them():
             return -9 * inputs.squeeze(-1)
 
         incumbent.begin()
-        assert not incumbent.challenge(own, values(own) + drawn(0, 30), values)  # its own episodes
-        assert incumbent.challenge(other, values(other) + drawn(1, 30, gain), values) is passes
+        assert not incumbent.challenge(own, values(own) + drawn(0, 30), values, SEEN)  # its own episodes
+        assert incumbent.challenge(other, values(other) + drawn(1, 30, gain), values, SEEN) is passes
         same = all(torch.equal(value, incumbent.learned.state_dict()[name]) for name, value in model.items())
         assert same is passes
 
 
 def test_several_iterations_count_together_and_its_state_goes_on():
-    def values(inputs):
-        return torch.zeros(len(inputs), dtype=F64)
-
     incumbent, starts, outcomes = make(5.0), torch.zeros(30, 1, dtype=F64), []
-    incumbent.challenge(starts, drawn(0, 30, failing=4), values)
+    incumbent.challenge(starts, drawn(0, 30, failing=4), nothing, SEEN)
     for k in range(ITERATIONS):
         copied = make(5.0)
         copied.load_state_dict(incumbent.state_dict())
-        arguments = (starts, drawn(k + 1, 30), values)
+        arguments = (starts, drawn(k + 1, 30), nothing, SEEN)
         for one in (incumbent, copied):
             one.begin()
         outcomes.append(incumbent.challenge(*arguments))
@@ -86,7 +99,7 @@ def test_unless_it_is_worse_a_policy_passes_but_many_small_losses_do_not():
     accepted = []
     for k in range(12):
         incumbent.begin()
-        accepted.append(incumbent.challenge(starts, drawn(k, 30, -0.02 * k), lambda inputs: 0 * inputs.squeeze(-1)))
+        accepted.append(incumbent.challenge(starts, drawn(k, 30, -0.02 * k), nothing, SEEN))
     assert accepted[0]  # there is nothing to compare it with
     assert any(accepted[1:])
     assert not any(accepted[6:])
@@ -101,9 +114,28 @@ def test_the_last_of_several_equal_policies_is_seldom_refused():
             incumbent, passed = make(0.0, errors), []
             for k in range(6):
                 incumbent.begin()
-                passed.append(incumbent.challenge(starts, drawn(10 * seed + k, 15), lambda inputs: inputs.squeeze(-1)))
+                passed.append(incumbent.challenge(starts, drawn(10 * seed + k, 15), nothing, SEEN))
             count += not passed[-1]
         return count
 
     assert refused(-3.0) <= 3
     assert refused(-1.65) > 10
+
+
+@pytest.mark.parametrize("errors", [-3.0, 1.65])
+def test_what_is_handed_out_changes_no_further_than_the_trust_region(errors):
+    """KL = offset²/2; only a start that is kept is replaced as a whole, by what is certainly better."""
+    incumbent = make(0.0, errors)
+    with torch.no_grad():
+        for line, offset in ((incumbent.learned, 0.0), (incumbent.learner, 4.0)):
+            line.weight.zero_()
+            line.bias.fill_(offset)
+    model, reached = incumbent.learner.state_dict(), 0.0
+    while reached < 4.0:
+        incumbent.follow(model, SEEN)
+        before, reached = reached, incumbent.learned.bias.item()
+        assert errors > 0 or 0.8 * REACH < (reached - before) ** 2 / 2 <= REACH or reached == 4.0
+        assert incumbent.learned.weight.item() == 0.0
+    assert (before == 0.0) is (errors > 0)
+    incumbent.follow({**model, "bias": torch.full((1,), torch.nan, dtype=F64)}, SEEN)
+    assert bool(incumbent.learned.bias.isfinite()) is (errors < 0)

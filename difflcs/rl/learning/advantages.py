@@ -22,6 +22,7 @@ from difflcs.rl.tasks import Features, compute_features
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
+    from difflcs.rl.learning.critic import Critic
     from difflcs.rl.learning.model_rollouts import ModelEnv
 
 SAMPLES = ("action", "action_log_prob")
@@ -95,23 +96,8 @@ def returns(rewards: Tensor, gamma: float) -> Tensor:
     return torch.stack(sums[::-1], 1)
 
 
-@dataclass(frozen=True)
-class GAE:
-    """Result of generalised advantage estimation.
-
-    Attributes:
-        values: (N, T) of the states, by the value network.
-        advantages: (N, T).
-        targets: (N, T) that the value network is to be fitted to: the sum of both.
-    """
-
-    values: Tensor
-    advantages: Tensor
-    targets: Tensor
-
-
-def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
-    """Generalised advantage estimation (Eq. 5 of the paper).
+def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> Tensor:
+    """Generalised advantage estimation (Eq. 5 of the paper): (N, T) advantages.
 
     The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
 
@@ -123,22 +109,7 @@ def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
     """
     now, following = values[:, :-1], values[:, 1:].clone()
     following[:, -1] = 0
-    advantages = returns(rewards + gamma * following - now, gamma * zeta)
-    return GAE(now, advantages, advantages + now)
-
-
-class ValueFunction(Protocol):
-    """The part of a `difflcs.rl.learning.critic.Critic` that estimators use."""
-
-    gamma: float
-
-    def values(self, inputs: Tensor) -> Tensor:
-        """(..., n) inputs → (...) values."""
-        ...
-
-    def gae(self, inputs: Tensor, rewards: Tensor) -> GAE:
-        """See `gae`, with its own discount and ζ."""
-        ...
+    return returns(rewards + gamma * following - now, gamma * zeta)
 
 
 class GAEAdvantages:
@@ -148,16 +119,16 @@ class GAEAdvantages:
         critic: the value network, with its discount and ζ.
     """
 
-    def __init__(self, critic: ValueFunction):
+    def __init__(self, critic: Critic):
         self.critic = critic
 
     def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
         """See `Advantages`."""
-        gae = self.critic.gae(inputs, rewards)
+        values, advantages = self.critic.gae(inputs, rewards)
         taken: Any = episodes["policy"]
         samples = taken.select(*SAMPLES).unsqueeze(-1)
-        samples["advantage"] = gae.advantages[..., None, None]
-        return Estimate(samples, gae.values, rewards)
+        samples["advantage"] = advantages[..., None, None]
+        return Estimate(samples, values, rewards)
 
 
 class MultiActionAdvantages:
@@ -176,7 +147,7 @@ class MultiActionAdvantages:
     def __init__(
         self,
         env: ModelEnv,
-        critic: ValueFunction,
+        critic: Critic,
         features: Features,
         scale: RewardScale,
         bounds: tuple[Tensor, Tensor],

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.advantages import GAE, gae, returns
+from difflcs.rl.learning.advantages import gae, returns
 from difflcs.rl.learning.least_squares import FlatAdam, gradients, tanh
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.seeding import seeded
@@ -62,9 +62,10 @@ class Critic:
         """(..., n_inputs) → (...), without gradients."""
         return self.network(inputs.float()).double().squeeze(-1)
 
-    def gae(self, inputs: Tensor, rewards: Tensor) -> GAE:
-        """See `difflcs.rl.learning.advantages.gae`."""
-        return gae(self.values(inputs), rewards, self.gamma, self.zeta)
+    def gae(self, inputs: Tensor, rewards: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and advantages (N, T), see `difflcs.rl.learning.advantages.gae`; their sum is what values aim at."""
+        values = self.values(inputs)
+        return values[:, :-1], gae(values, rewards, self.gamma, self.zeta)
 
     def begin(self, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> None:
         """Fit the network to the returns of the first episodes, before the first advantages; later do nothing.
@@ -87,7 +88,7 @@ class Critic:
             epochs: passes over the episodes.
         """
         self.history = [*self.history, (inputs, rewards)][-_ITERATIONS:]
-        targets = [self.gae(*part).targets for part in self.history]
+        targets = [torch.add(*self.gae(*part)) for part in self.history]
         seen = torch.cat([inputs[:, :-1] for inputs, _ in self.history])
         self._fit(seen, torch.cat(targets), epochs, (*key, len(self.history) + 1))
 

@@ -1,13 +1,13 @@
-"""The policy that a training hands out: replaced only by one that did better in the robot's own episodes.
+"""The policy that a training hands out: it changes only as far as the robot's own episodes allow.
 
 Many steps of PPO make a good policy worse until later ones mend it. So PPO goes on learning as it does, and its policy
 is handed out only if a one-sided test allows it, on the returns of its newest episodes and those of the best policy so
 far, all played with the same noise. A start that works already plays first, and is replaced by nothing but what is
-certainly better. A poor one is replaced by the first policy that PPO plays. PPO makes that better in many small steps,
-none of them certain in few episodes, so it is replaced unless the new one is certainly worse; it is always compared
-with the best, so that many small losses are seen. The best of several was lucky, too: -1.65 standard errors, 5 % of a
-single comparison, refuse the last of six equal policies in 13 to 29 % of all trainings, -3 in 1 to 2 %.
-The test has two additions:
+certainly better. PPO makes a poor one better in many small steps, none of them certain in few episodes. So what is
+handed out follows the policies that have played unless they are certainly worse than the best of them: -1.65 standard
+errors, 5 % of a single comparison, refuse the last of six equal policies in 13 to 29 % of all trainings, -3 in 1 to 2
+%, as the best of several was lucky, too. And no step of it is longer than a trust region, `REACH`, which also bounds
+those that no test can judge, the first and the last. The test has two additions:
 
 - Episodes differ most by their goals. What the value network expects of a start is subtracted from its return.
 - A policy that fails in 3 % of its episodes fails in none of thirty as often as not. So the test counts one failed
@@ -16,6 +16,7 @@ The test has two additions:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +25,17 @@ from torch import Tensor
 
 from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.state_tree import State, copy_state
+from difflcs.rl.learning.surrogate import gaussian_kl, trimmed_mean
 
 if TYPE_CHECKING:
+    from tensordict import TensorDict
+
     from difflcs.rl.learning.policy import GaussianPolicy
 
 ITERATIONS = 3
 """Newest iterations whose episodes count for a policy: the newest alone, the newest two, or three."""
+REACH = 1.0
+"""KL divergence, on states that PPO takes no step on, by which what is handed out changes at most at once."""
 
 
 def is_better(new: Tensor, old: Tensor, failure: float, errors: float) -> bool:
@@ -60,7 +66,7 @@ class Incumbent:
     """
 
     def __init__(self, best: GaussianPolicy, learner: GaussianPolicy, failure: float, errors: float, n_inputs: int):
-        self.policy, self.learned = best.controller, check_learned(best.learned)
+        self.actor, self.learned = best, check_learned(best.learned)
         self.learner = check_learned(learner.learned)
         self.failure, self.errors = failure, errors
         self._playing: State = {}
@@ -78,31 +84,54 @@ class Incumbent:
         """Remember the learner as it is: it plays now."""
         self._playing = copy_state(self.learner.state_dict())
 
-    def challenge(self, starts: Tensor, returns: Tensor, values: Callable[[Tensor], Tensor]) -> bool:
-        """Let the model that has played take its place if the test allows it. The first one is not tested.
+    def challenge(
+        self, starts: Tensor, returns: Tensor, values: Callable[[Tensor], Tensor], held_out: TensorDict
+    ) -> bool:
+        """Let the model that has played take its place if the test allows it, or follow it, see `follow`.
+
+        The first one is not tested where the start need not be kept.
 
         Args:
             starts: (N, n_inputs) inputs of the value network at the start of its episodes.
             returns: (N,) sums of scaled rewards.
             values: the value network.
+            held_out: see `follow`.
 
         Returns:
-            True if the model took its place.
+            True if the test allowed it.
         """
         self.episodes.append((starts, returns))
         if len(self.episodes) == 1 and not self.keeps_start:
-            self.learned.load_state_dict(self._playing)
+            self.follow(self._playing, held_out)
             return True
         del self.episodes[1:-ITERATIONS]
         gains = [outcome - values(start) for start, outcome in self.episodes]
         for count in range(1, len(self.episodes)):
             newest = torch.cat(gains[-count:])
             if is_better(newest, gains[0], self.failure, self.errors):
-                self.learned.load_state_dict(self._playing)
+                self.follow(self._playing, held_out)
                 if newest.mean() > gains[0].mean():
                     self.episodes = [self._join(self.episodes[-count:])]
                 return True
         return False
+
+    @torch.no_grad()
+    def follow(self, model: State, held_out: TensorDict) -> None:
+        """Hand out a model; where the start need not be kept, the one on the way to it that the trust region reaches.
+
+        Args:
+            model: its `state_dict`.
+            held_out: (N,) what the policy sees in states from which no step to the model was computed.
+        """
+        now, before, share = copy_state(self.learned.state_dict()), self.actor.solve(held_out.clone()), 1.0
+        self.learned.load_state_dict(model)
+        while not self.keeps_start:
+            kl = trimmed_mean(gaussian_kl(before, self.actor.solve(held_out.clone())))
+            if kl <= REACH or not share:
+                break
+            share = share * min(0.9, math.sqrt(REACH / kl)) if share > 0.01 else 0.0  # 0.9 where it is not finite
+            part = {k: now[k].lerp(v, share) if v.is_floating_point() else v for k, v in model.items()}
+            self.learned.load_state_dict(part if share else now)
 
     def state_dict(self) -> dict[str, Any]:
         """The learner's parameters, and all episodes, one iteration after another; those of the best are number 0."""

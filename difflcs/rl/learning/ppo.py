@@ -64,7 +64,7 @@ class PPOReport:
         gradient_seconds: wall time of gradients and steps.
         value_seconds: wall time of advantages and value network.
         model_seconds: wall time of all model rollouts: the ensemble's training, episodes, solves, gradients.
-        accepted: 1 if its policy is handed out, 0 if an earlier one stays, see `Incumbent`.
+        accepted: 1 if what is handed out follows its policy, 0 if it stays, see `Incumbent`.
     """
 
     iteration: int
@@ -90,6 +90,9 @@ class PPOReport:
     model_seconds: float
     accepted: int
 
+
+_HELD_OUT = 300
+"""States on which a trust region bounds what is handed out."""
 
 # --- the parts --------------------------------------------------------------------------------------------------------
 
@@ -170,7 +173,7 @@ class PPO(Trainer):
         remaining = total_episodes - first_episode
         if robot.env.num_envs < min(rollouts, remaining):
             raise InvalidInputError(f"env: expected at least {rollouts} environments, got {robot.env.num_envs}")
-        best = (learned, actor.controller) if incumbent is None else (incumbent.learned, incumbent.policy)
+        best = (learned, actor.controller) if incumbent is None else (incumbent.learned, incumbent.actor.controller)
         super().__init__(*best, seed, episode_steps)
         self.actor, self.robot, self.critic, self.surrogate, self.update = actor, robot, critic, surrogate, update
         self.scale, self.features, self.max_kl, self.final_step = scale, features, max_kl, final_step
@@ -197,7 +200,7 @@ class PPO(Trainer):
 
         Iterations on model rollouts come first, if there are models with real episodes. More of them follow the last
         real episodes where the settings say so. The robot does not try what they teach, so it is handed out only after
-        a policy that was accepted, and where the start need not be kept.
+        a policy that was accepted, where the start need not be kept, and as far as the trust region reaches.
 
         Raises:
             InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
@@ -219,44 +222,45 @@ class PPO(Trainer):
         std, step_size = float(self.actor.std.mean()), self.update.size.value
         real_scale = scale if self.models is None else self.models.settings.real_step * scale
         outcome = self._iterate(self.robot, seeds, (), real_scale, after_step)
-        episodes, improvement = outcome.episodes, outcome.improvement
+        episodes = outcome.episodes
+        held_out = self._held_out(episodes)
         if self.models is not None:
             self.update.size.value = step_size  # it follows the model rollouts alone
             self.models.add(episodes)
         kept = self.incumbent
-        accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
+        accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values, held_out)
         self.iteration += 1
         if self.done and self.models is not None:
             start = time.perf_counter()
             for k in range(self.models.settings.last):
                 model_success, model_loss = self._train_on_models(scale, 1 + k * self.models.settings.iterations)
             if kept is not None and accepted and not kept.keeps_start:
-                kept.learned.load_state_dict(kept.learner.state_dict())
+                kept.follow(kept.learner.state_dict(), held_out)
             model_seconds += time.perf_counter() - start
         return PPOReport(
             iteration=self.iteration,
             env_steps=self.env_steps,
             success=float(episodes["success"].double().mean()),
             mean_return=float(outcome.returns.mean()) / self.scale.factor,
-            kl=improvement.kl,
             learning_rate=step_size,
             std=std,
-            gradient_steps=improvement.steps,
-            skipped_steps=improvement.skipped,
-            clip_fraction=improvement.clip_fraction,
-            outliers=improvement.outliers,
-            explained_variance=outcome.explained_variance,
-            solver_failures=int(episodes["failures"].sum()) + improvement.solver_failures,
             unstable=int((~episodes["stable"]).sum()),
             model_success=model_success,
             model_loss=model_loss,
-            physics_seconds=outcome.physics_seconds,
-            solve_seconds=outcome.solve_seconds + improvement.solve_seconds,
-            gradient_seconds=improvement.gradient_seconds,
-            value_seconds=outcome.value_seconds,
             model_seconds=model_seconds,
             accepted=int(accepted),
+            **outcome.report,
         )
+
+    def _held_out(self, newest: TensorDict) -> TensorDict:
+        """(N,) what the policy sees inside the episodes of a warm-up, of which no step is computed; else the newest."""
+        from tensordict import TensorDict
+
+        earlier = [] if self.models is None else self.models.episodes[: self.first_episode]
+        seen = _observed(cast("TensorDict", earlier if len(earlier) else newest[newest["stable"]]))
+        inside = {name: value[:, 1:].flatten(0, 1) for name, value in seen.items()}  # models start at the first states
+        chosen = torch.linspace(0, len(inside["state"]) - 1, _HELD_OUT).long().unique()
+        return TensorDict({name: value[chosen] for name, value in inside.items()}, [len(chosen)])
 
     def _train_on_models(self, scale: float, first: int = 1) -> tuple[float | None, float | None]:
         """Run the iterations on model rollouts; return the success of the last ones and the loss of the ensemble.
@@ -301,8 +305,11 @@ class PPO(Trainer):
         start = time.perf_counter()
         self.critic.learn(inputs, estimate.rewards, key(Stream.VALUE), source.value_epochs)
         value_seconds += time.perf_counter() - start
-        explained, seconds = 1 - float(unexplained), (physics_seconds, solve_seconds, value_seconds)
-        return _Outcome(episodes, improvement, inputs[:, 0], rewards.sum(1), explained, *seconds)
+        improvement.solver_failures += int(episodes["failures"].sum())
+        improvement.solve_seconds += solve_seconds
+        report = {"explained_variance": 1 - float(unexplained), **vars(improvement)}
+        report |= {"physics_seconds": physics_seconds, "value_seconds": value_seconds}
+        return _Outcome(episodes, inputs[:, 0], rewards.sum(1), report)
 
     def _collect(
         self, env: VectorEnv, seeds: list[int], key: Sequence[int], after_step: AfterStep | None
@@ -362,14 +369,14 @@ class PPO(Trainer):
 
             kl = gaussian_kl(old, new)
             outcome.kl = trimmed_mean(kl)
-            if not outcome.kl <= self.max_kl and outcome.steps:
+            if not outcome.kl <= self.max_kl and outcome.gradient_steps:
                 break
             loss = self.surrogate(new, old, kl, cast("TensorDict", samples[chosen]), episodes, rng)
             outcome.outliers, outcome.clip_fraction = self.surrogate.outliers, self.surrogate.clip_fraction
             if self.update.step(loss, scale):
-                outcome.steps += 1
+                outcome.gradient_steps += 1
             else:
-                outcome.skipped += 1
+                outcome.skipped_steps += 1
             outcome.gradient_seconds += time.perf_counter() - solved
         self.update.size.adapt(outcome.kl / scale**2)
         return outcome
@@ -405,11 +412,11 @@ class PPO(Trainer):
 
 @dataclass
 class _Improvement:
-    """Result of the gradient steps of one iteration."""
+    """Result of the gradient steps of one iteration, as in `PPOReport`."""
 
     kl: float = 0.0
-    steps: int = 0
-    skipped: int = 0
+    gradient_steps: int = 0
+    skipped_steps: int = 0
     clip_fraction: float = 0.0
     outliers: float = 0.0
     solver_failures: int = 0
@@ -419,27 +426,26 @@ class _Improvement:
 
 @dataclass
 class _Outcome:
-    """Result of one iteration, on the robot or on model rollouts."""
+    """Result of one iteration, on the robot or on model rollouts; `report` has fields of a `PPOReport`."""
 
     episodes: TensorDict
-    improvement: _Improvement
     starts: Tensor
     returns: Tensor
-    explained_variance: float
-    physics_seconds: float
-    solve_seconds: float
-    value_seconds: float
+    report: dict[str, Any]
+
+
+def _observed(episodes: TensorDict) -> dict[str, Tensor]:
+    """(N, T+1, ...) what the policy sees at each state of episodes, by its keys."""
+    shape = episodes["state"].shape[:-1]
+    seen = {"state": episodes["state"], "elapsed": elapsed_fractions(shape[1] - 1).expand(shape)}
+    constant = (name for name in ("goal", CONTEXT) if name in episodes.keys())
+    return seen | {name: episodes[name].unsqueeze(1).expand(*shape, -1) for name in constant}
 
 
 def _inputs(features: Features, episodes: TensorDict) -> Tensor:
     """(N, T+1, n) inputs of the value network."""
-    states = episodes["state"]
-    steps = states.shape[1]
-    goals = episodes["goal"].unsqueeze(1).expand(-1, steps, -1)
-    elapsed = elapsed_fractions(steps - 1).expand(states.shape[:-1])
-    context = episodes.get(CONTEXT, None)
-    context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
-    return compute_features(features, states, goals, elapsed, context)
+    seen = _observed(episodes)
+    return compute_features(features, seen["state"], seen["goal"], seen["elapsed"], seen.get(CONTEXT))
 
 
 def _step_data(actor: GaussianPolicy, policy: Any) -> TensorDict:

@@ -144,29 +144,23 @@ def make_ppo(
     judge = GAEAdvantages(critic)
     practice = None
     if models is not None:
-        rollouts = models.settings
-        bounds = action_bounds(env)
-        many = MultiActionAdvantages(models.env, critic, features, scale, bounds, rollouts.actions)
-        practice = Source(
-            models.env,
-            many if rollouts.actions > 1 else judge,
-            rollouts.steps,
-            settings.minibatch,
-            rollouts.value_epochs,
-        )
+        own = models.settings
+        many = MultiActionAdvantages(models.env, critic, features, scale, action_bounds(env), own.actions)
+        part = many if own.actions > 1 else judge
+        practice = Source(models.env, part, own.steps, settings.minibatch, own.value_epochs)
     incumbent = None
     if settings.gain is not None:
         best, actor = actor, copy.deepcopy(actor)
-        failure = settings.reward_scale * failure_penalty
-        incumbent = Incumbent(best, actor, failure, settings.gain, n_inputs)
-    betas = settings.adam.betas
-    deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
+        incumbent = Incumbent(best, actor, settings.reward_scale * failure_penalty, settings.gain, n_inputs)
+    deviation = Deviation(actor, settings.std_learning_rate, settings.adam.betas, settings.std_range)
+    own = getattr(settings, settings.update)
+    rule = _UPDATES[settings.update](actor, own, settings.target_kl, settings.step_factor, deviation)
     return PPO(
         actor,
         Source(env, judge, settings.steps, settings.minibatch, settings.critic.epochs.each),
         critic,
         Surrogate(actor, settings.clip, OUTLIER_KL, settings.beta, settings.violation if lcs else None),
-        _UPDATES[settings.update](actor, settings, deviation),
+        rule,
         scale,
         seed,
         features=features,
@@ -183,11 +177,4 @@ def make_ppo(
     )
 
 
-_UPDATES: dict[str, Callable[[Any, PPOSettings, Deviation], UpdateRule]] = {
-    "natural": lambda actor, settings, deviation: NaturalUpdate(
-        actor, settings.natural, settings.target_kl, settings.step_factor, deviation
-    ),
-    "adam": lambda actor, settings, deviation: AdamUpdate(
-        actor, settings.adam, settings.target_kl, settings.step_factor, deviation
-    ),
-}
+_UPDATES: dict[str, Callable[..., UpdateRule]] = {"natural": NaturalUpdate, "adam": AdamUpdate}
