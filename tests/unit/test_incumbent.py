@@ -126,16 +126,16 @@ def test_the_last_of_several_equal_policies_is_seldom_refused():
 def test_what_is_handed_out_changes_no_further_than_the_trust_region(errors):
     """KL = offset²/2; only a start that is kept is replaced as a whole, by what is certainly better."""
     incumbent = make(0.0, errors)
-    with torch.no_grad():
-        for line, offset in ((incumbent.learned, 0.0), (incumbent.learner, 4.0)):
-            line.weight.zero_()
-            line.bias.fill_(offset)
-    model, reached = incumbent.learner.state_dict(), 0.0
+    handed_out, model = incumbent.learned.state_dict(), incumbent.learner.state_dict()
+    for line, offset in ((handed_out, 0.0), (model, 4.0)):
+        line["weight"].zero_()
+        line["bias"].fill_(offset)
+    before, reached = 0.0, 0.0
     while reached < 4.0:
         incumbent.follow(model, SEEN)
-        before, reached = reached, incumbent.learned.bias.item()
+        before, reached = reached, float(handed_out["bias"])
         assert errors > 0 or 0.8 * REACH < (reached - before) ** 2 / 2 <= REACH or reached == 4.0
-        assert incumbent.learned.weight.item() == 0.0
+        assert float(handed_out["weight"]) == 0.0
     assert (before == 0.0) is (errors > 0)
     incumbent.follow({**model, "bias": torch.full((1,), torch.nan, dtype=F64)}, SEEN)
-    assert bool(incumbent.learned.bias.isfinite()) is (errors < 0)
+    assert bool(handed_out["bias"].isfinite()) is (errors < 0)
