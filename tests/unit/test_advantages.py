@@ -10,14 +10,8 @@ from torch.distributions import MultivariateNormal
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import CriticSettings
-from difflcs.rl.learning.advantages import (
-    MultiActionAdvantages,
-    RewardScale,
-    mirrored_actions,
-    multi_action_advantages,
-    returns,
-)
-from difflcs.rl.learning.critic import Critic
+from difflcs.rl.learning.advantages import MultiActionAdvantages, RewardScale, mirrored_actions, multi_action_advantages
+from difflcs.rl.learning.critic import Critic, returns
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from difflcs.errors import InvalidInputError
+from difflcs.rl.learning.critic import Critic
 from difflcs.rl.rollout import CONTEXT, elapsed_fractions
 from difflcs.rl.seeding import seeded
 from difflcs.rl.tasks import Features, compute_features
@@ -22,7 +23,6 @@ from difflcs.rl.tasks import Features, compute_features
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
-    from difflcs.rl.learning.critic import Critic
     from difflcs.rl.learning.model_rollouts import ModelEnv
 
 SAMPLES = ("action", "action_log_prob")
@@ -84,32 +84,6 @@ class RewardScale:
         if not bool(torch.isfinite(rewards).all()):
             raise InvalidInputError("env: expected finite rewards, got NaN or infinity; mend the environment's reward")
         return self.factor * rewards
-
-
-def returns(rewards: Tensor, gamma: float) -> Tensor:
-    """Sum the discounted rewards (N, T) from each step to the end: (N, T)."""
-    total = torch.zeros(len(rewards), dtype=rewards.dtype)
-    sums = []
-    for reward in reversed(rewards.unbind(1)):
-        total = reward + gamma * total
-        sums.append(total)
-    return torch.stack(sums[::-1], 1)
-
-
-def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> Tensor:
-    """Generalised advantage estimation (Eq. 5 of the paper): (N, T) advantages.
-
-    The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
-
-    Args:
-        values: (N, T+1) of the states, the last of which does not count.
-        rewards: (N, T).
-        gamma: discount per step.
-        zeta: ζ, often called lambda.
-    """
-    now, following = values[:, :-1], values[:, 1:].clone()
-    following[:, -1] = 0
-    return returns(rewards + gamma * following - now, gamma * zeta)
 
 
 class GAEAdvantages:

@@ -1,4 +1,4 @@
-"""The value network of PPO, and its fit to the newest episodes."""
+"""The value network of PPO, its fit to the newest episodes, and generalised advantage estimation (GAE) by it."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.advantages import gae, returns
 from difflcs.rl.learning.least_squares import FlatAdam, gradients, tanh
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.seeding import seeded
@@ -63,7 +62,7 @@ class Critic:
         return self.network(inputs.float()).double().squeeze(-1)
 
     def gae(self, inputs: Tensor, rewards: Tensor) -> tuple[Tensor, Tensor]:
-        """Values and advantages (N, T), see `difflcs.rl.learning.advantages.gae`; their sum is what values aim at."""
+        """Values and advantages (N, T), see `gae`; their sum is what values aim at."""
         values = self.values(inputs)
         return values[:, :-1], gae(values, rewards, self.gamma, self.zeta)
 
@@ -133,3 +132,29 @@ class Critic:
         self._adam.load_state_dict(state["adam"])
         sizes = counts.tolist()
         self.history = list(zip(episodes["inputs"].split(sizes), episodes["rewards"].split(sizes), strict=True))
+
+
+def returns(rewards: Tensor, gamma: float) -> Tensor:
+    """Sum the discounted rewards (N, T) from each step to the end: (N, T)."""
+    total = torch.zeros(len(rewards), dtype=rewards.dtype)
+    sums = []
+    for reward in reversed(rewards.unbind(1)):
+        total = reward + gamma * total
+        sums.append(total)
+    return torch.stack(sums[::-1], 1)
+
+
+def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> Tensor:
+    """Generalised advantage estimation (Eq. 5 of the paper): (N, T) advantages.
+
+    The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
+
+    Args:
+        values: (N, T+1) of the states, the last of which does not count.
+        rewards: (N, T).
+        gamma: discount per step.
+        zeta: ζ, often called lambda.
+    """
+    now, following = values[:, :-1], values[:, 1:].clone()
+    following[:, -1] = 0
+    return returns(rewards + gamma * following - now, gamma * zeta)

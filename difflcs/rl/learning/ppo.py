@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
+from difflcs.rl.learning.advantages import Advantages, RewardScale
 from difflcs.rl.learning.checks import check_learned
-from difflcs.rl.learning.critic import Critic
+from difflcs.rl.learning.critic import Critic, returns
 from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
