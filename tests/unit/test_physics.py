@@ -401,6 +401,7 @@ def test_the_centre_of_mass_keeps_its_velocity_wherever_the_origin_is(damping):
 def test_a_body_turns_about_its_centre_of_mass():
     # A push through the centre of mass, which is not in the middle, turns nothing; one through the middle does.
     system = pushing(center_of_mass=(0.0, 0.01), friction=0.0)
+    assert system.n_lam == 1  # a force along the normal alone
     x = tensor([[0.0, 0.0, 0.0, -0.04, 0.01], [0.0, 0.0, 0.0, -0.04, 0.0]])
     after = system.params(x).step(x, tensor([0.01, 0.0])).x_next
     torch.testing.assert_close(after[0, :3], tensor([0.01, 0.0, 0.0]), rtol=0, atol=1e-6)

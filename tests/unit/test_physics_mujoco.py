@@ -153,6 +153,7 @@ def test_missing_contacts_are_out_of_reach_and_the_nearest_are_kept():
 FRICTION = {
     "the larger": ('friction="0.5"', 'friction="0.3"', "", 0.5),
     "of higher priority": ('friction="0.5"', 'friction="0.3" priority="1"', "", 0.3),
+    "of the box, of higher priority": ('friction="0.3" priority="1"', 'friction="0.5"', "", 0.3),
     "none where both have none": ('friction="0.5" condim="1"', 'friction="0.3" condim="1"', "", 0.0),
     "some where one has": ('friction="0.5" condim="1"', 'friction="0.3" condim="3"', "", 0.5),
     "of the pair": ("", "", '<contact><pair geom1="tip" geom2="block" friction=".7 .7 .1 .1 .1"/></contact>', 0.7),

@@ -312,7 +312,6 @@ def _add_finger(spec: mujoco.MjSpec, finger: int) -> None:
         motor = spec.add_actuator(
             name=f"motor_{finger}_{joint}", target=f"joint_{finger}_{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
-        motor.gear[0] = 1.0
         links.append(link)
         parent = link
     upper, middle, lower = links
