@@ -114,6 +114,17 @@ def test_bounds_of_actions_are_those_that_limits_leave(kind, low, high):
     torch.testing.assert_close(bounds, wanted, rtol=0.05, atol=1e-6)
 
 
+@pytest.mark.parametrize(("drive", "harder"), [('kp="2000" kv="20" forcerange="-2 9"', True), ('kp="9"', False)])
+@pytest.mark.parametrize("motion", ["dynamic", "quasi-dynamic"])
+def test_a_servo_that_pushes_harder_than_it_can_is_warned_of_once(motion, drive, harder, recwarn):
+    weight = '<body pos=".21 0 0"><joint type="slide" axis="1 0 0"/><geom size=".1" mass="9"/></body></worldbody>'
+    xml = SLIDE.format("Euler", f'<position name="push" joint="a" {drive}/>', "").replace("</worldbody>", weight)
+    module = MujocoLCS(mujoco.MjModel.from_xml_string(xml), motion=motion, seconds=0.1)
+    for _ in range(2):
+        module.params(torch.zeros(module.n_x, dtype=torch.float64))
+    assert ["actuator push, " in str(w.message) and "at ±0.001" in str(w.message) for w in recwarn] == [True] * harder
+
+
 @pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])
 def test_a_plan_keeps_a_servo_within_its_range(motion):
     model = load('<position joint="a" kp="100" kv="20" ctrlrange="-.05 .1"/>')

@@ -12,6 +12,7 @@ from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco import ContactGroup, MujocoLCS, MujocoState
 from tests.conftest import refuse
 
+FLOOR = '<geom name="floor" type="plane" size="1 1 .1"/>'
 BOX = '<body name="box" pos="{}"><freejoint/><geom name="block" type="box" size=".05 .03 .02" mass="{}"/></body>'
 
 
@@ -77,7 +78,7 @@ def test_a_servo_holds_against_gravity_and_gives_way_by_its_stiffness():
 
 def test_a_box_rests_on_the_floor_and_is_dragged_by_friction():
     """It stays though gravity acts; a force below the friction does not move it far, one above it does."""
-    model = load('<geom name="floor" type="plane" size="1 1 .1"/>' + BOX.format("0 0 .02", 0.5))
+    model = load(FLOOR + BOX.format("0 0 .02", 0.5))
     for force, least, most in ((0.0, -1e-5, 1e-5), (2.0, 0.0, 3e-3), (10.0, 0.05, 0.2)):
         data = mujoco.MjData(model)
         data.xfrc_applied[1, 0] = force
@@ -92,12 +93,7 @@ def stack():
     """Two boxes side by side on a floor, a ball beside them."""
     ball = '<body name="ball" pos="0 .1 .02"><freejoint/><geom name="round" size=".02" mass=".1"/></body>'
     other = BOX.replace('"box"', '"other"', 1).replace('"block"', '"brick"')
-    return load(
-        '<geom name="floor" type="plane" size="1 1 .1"/>'
-        + BOX.format("0 0 .02", 0.5)
-        + other.format(".101 0 .02", 1)
-        + ball
-    )
+    return load(FLOOR + BOX.format("0 0 .02", 0.5) + other.format(".101 0 .02", 1) + ball)
 
 
 def test_groups_have_budgets_of_contacts_and_of_friction():
@@ -122,7 +118,7 @@ def test_groups_have_budgets_of_contacts_and_of_friction():
 
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
 def test_what_rests_on_contacts_of_a_group_without_friction_does_not_creep(cone):
-    model = load('<geom name="floor" type="plane" size="1 1 .1"/>' + BOX.format("0 0 .02", 0.5))
+    model = load(FLOOR + BOX.format("0 0 .02", 0.5))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 2000)
     module = MujocoLCS(model, motion="dynamic", contacts=[ContactGroup(None, 4, friction=False)], cone=cone)

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_kind, check_tensor
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.errors import ContactWarning, InvalidInputError, ShapeError, warn
 from difflcs.physics.mujoco.native import flags, to_numpy
 
 Array = NDArray[np.float64]
 
+_WEAK = 0.8  # part of its force that motion leaves of it, below which a servo pushes much harder than it can
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 _JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 _JOINTS = _JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -126,6 +127,19 @@ class Actuators:
         resists += np.maximum(-self._damping, 0.0)[:, None, None] * velocity
         lost = self.gear**2 * resists[np.arange(len(self.dof)), self.dof, self.dof]
         return np.where(self.dof >= 0, np.clip(1 - lost, 0.01, 1.0), 1.0)
+
+    def warn_of_weak(self, yields: Array, model: Any) -> None:
+        """Warn of servos that within their bounds push much harder against a contact than they can."""
+        least, gain = np.abs(self._force).min(0), np.abs(self._gain)
+        weak = (self.dof >= 0) & (yields < _WEAK) & (np.ptp(self.range, axis=0) * gain > least) & np.isfinite(least)
+        if weak.any():
+            i = int(np.where(weak, yields, np.inf).argmin())
+            warn(
+                f"expected servos that push no harder than they can, got actuator {model.actuator(i).name or i}, which may "
+                f"push up to {1 / yields[i]:.3g} times as hard as that against a contact: take fewer seconds, or keep the "
+                f"layer's bounds of its action at ±{least[i] / gain[i]:.3g}",
+                ContactWarning,
+            )
 
     def nominal(self, ctrl: Tensor, batch: torch.Size) -> Array:
         """Return nominal controls (*batch, nu) as an array.

@@ -424,10 +424,13 @@ def _respond(of: MujocoLCS) -> tuple[float, Any]:
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
+    first, of._tried = not of._tried, True
+    if first and of.n_contacts and not of._quasi_static:
+        of._actuators.warn_of_weak(of._yields, of._model)
     if step is None or of._whole is None:
         return
-    if of._actuators.curved.size or not of._tried:
-        read.doubtful[:_TRIED], of._tried = True, True
+    if of._actuators.curved.size or first:
+        read.doubtful[:_TRIED] = True
     some = np.flatnonzero(read.doubtful)
     if not some.size:
         return
