@@ -135,8 +135,8 @@ class Actuators:
         if weak.any():
             i = int(np.where(weak, yields, np.inf).argmin())
             warn(
-                f"expected servos that push no harder than they can, got actuator {model.actuator(i).name or i}, which may "
-                f"push up to {1 / yields[i]:.3g} times as hard as that against a contact: take fewer seconds, or keep the "
+                f"expected servos that push no harder than they can, got actuator {model.actuator(i).name or i}, which "
+                f"may push up to {1 / yields[i]:.3g} times as hard against a contact: take fewer seconds, or keep the "
                 f"layer's bounds of its action at ±{least[i] / gain[i]:.3g}",
                 ContactWarning,
             )
