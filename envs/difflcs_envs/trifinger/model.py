@@ -309,7 +309,7 @@ def _add_finger(spec: mujoco.MjSpec, finger: int) -> None:
             range=JOINT_RANGES[joint],
             limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         )
-        motor = spec.add_actuator(
+        spec.add_actuator(
             name=f"motor_{finger}_{joint}", target=f"joint_{finger}_{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         links.append(link)
