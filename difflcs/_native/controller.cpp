@@ -18,7 +18,7 @@ class Alone final : public Runner {
     if (seconds < 1e9) ends_ = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(seconds, 0.0)));
   }
 
-  void run(int64_t, int64_t, bool to_the_end, Work work, void* context) override {
+  void run(const Kernels&, const MpcBatch&, bool to_the_end, Work work, void* context) override {
     work(context, workspace_, {to_the_end ? [](void*) { return false; } : &Alone::ask, this});
   }
   bool stopped() const override { return late_; }

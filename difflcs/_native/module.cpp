@@ -232,9 +232,11 @@ struct Threads final : difflcs::Runner {
   const int64_t most;
   Stop stop;
   Threads(int64_t most, double time_limit) : most(most), stop(time_limit) {}
-  void run(int64_t problems, int64_t workspace_bytes, bool to_the_end, Work work, void* context) override {
+  void run(const difflcs::Kernels& kernels, const difflcs::MpcBatch& batch, bool to_the_end, Work work,
+           void* context) override {
     Stop never;
-    const int64_t used = std::max<int64_t>(1, std::min<int64_t>(most, problems / difflcs::kernels().lanes));
+    const int64_t used = std::max<int64_t>(1, std::min<int64_t>(most, batch.count / difflcs::kernels().lanes));
+    const int64_t workspace_bytes = kernels.mpc_workspace(batch);
     AlignedBuffer mine;  // not in `kept` meanwhile: a signal handler may call, too
     if (workspace_bytes <= kMostKept) std::swap(mine, kept.workspace);
     if (mine.bytes < workspace_bytes) mine = AlignedBuffer(workspace_bytes);

@@ -256,7 +256,7 @@ void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
   std::fill_n(solve.iterations, batch.count, 0);
   Solving context{kernels, batch, solve, 0};
   runner.run(
-      batch.count, kernels.mpc_workspace(batch), solve.max_iter == 0,  // which takes no time
+      kernels, batch, solve.max_iter == 0,  // which takes no time
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
         const bool large = c.batch.n_x + c.batch.n_u >= kAlone || c.batch.n_lam >= kAloneForces;
@@ -270,7 +270,7 @@ void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
 void MpcSearch::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
   Solving context{kernels, batch, results, 0};
   runner.run(
-      batch.count, kernels.mpc_workspace(batch), true,
+      kernels, batch, true,
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
         constexpr int64_t block = 64;

@@ -45,7 +45,7 @@ struct Bound {
 // `to_the_end`: whatever the time.
 struct Runner {
   using Work = void (*)(void* context, void* workspace, Watch watch);
-  virtual void run(int64_t problems, int64_t workspace_bytes, bool to_the_end, Work work, void* context) = 0;
+  virtual void run(const Kernels& kernels, const MpcBatch& batch, bool to_the_end, Work work, void* context) = 0;
   virtual bool stopped() const = 0;
 
  protected:
