@@ -5,7 +5,7 @@
 // conditions and their sensitivity, and the names are the names there:
 //   relaxed_lcp.hpp     lam of one stage (low_rank.hpp: large)  mpc_problem.hpp  data, dynamics, cost
 //   linearisation.hpp   a stage with lam eliminated             riccati.hpp      gradient, active bounds, feedback law
-//   solve.hpp           projected Newton along the homotopy     progress.hpp     how far each problem has come
+//   newton.hpp          projected Newton along the homotopy     progress.hpp     how far each problem has come
 //   adjoint.hpp         directions of the solution              input_gradients.hpp  gradients of the inputs
 //   certificate.hpp     judges what is stored, from the stored numbers alone, whatever the solver thinks of them
 //
@@ -14,7 +14,7 @@
 // A problem alone would leave lanes idle: for it all of this is compiled once more with a single lane, and neighbouring
 // columns of matrices fill the vectors (`by_columns`).
 #include "kernels.hpp"
-#include "solve.hpp"
+#include "newton.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {

@@ -6,7 +6,7 @@
 #endif
 #include "adjoint.hpp"
 #include "kernels.hpp"
-#include "solve.hpp"
+#include "newton.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
