@@ -59,6 +59,7 @@ RESTING = {  # bodies, the rest of the model, control, number of free bodies
 
 @pytest.mark.parametrize("option", [FIRM, ""])
 @pytest.mark.parametrize("name", RESTING)
+@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")  # as one lets go
 def test_what_friction_holds_stays_as_in_mujoco_by_the_right_force(name, option):
     bodies, rest, ctrl, free = RESTING[name]
     model = load(bodies, rest, option)
@@ -170,6 +171,7 @@ def test_a_nominal_control_is_checked():
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.1])
+@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")
 def test_fast_and_unstable_robots_have_a_system_at_every_state(seconds):
     floor = '<geom type="plane" size="2 2 .1" pos="0 0 -.42"/>'
     module = MujocoLCS(load(floor + FREE, ACTUATORS["motors"]), motion="dynamic", seconds=seconds)

@@ -36,6 +36,7 @@ _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
+_HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -158,7 +159,7 @@ def correct(
 
 
 def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:
-    """Warn where velocities are farther from MuJoCo's than those before the step, with some actions.
+    """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
     without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
@@ -171,16 +172,19 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
     off, alone = predicted - after, np.nan_to_num(size(free - before), nan=np.inf).min(0)
     least, change = _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2)), size(after - before)
     alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
-    most = change + _FARTHER * (size(before) + alone) + least
-    wrong = (size(off) > most).any(0)
+    moves = size(before) + alone
+    most = change + _FARTHER * moves + least
+    held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
+    excess = size(off) - np.where(held, 0.0, most)
+    wrong = np.any(excess > 0, 0)
     if wrong.any():
-        worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)
+        worst = np.unravel_index(np.nanargmax(excess), most.shape)
         dof = int(np.argmax(np.abs(off[worst] * (mass[worst[1]] @ off[worst]))))
         joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
         warn(
-            f"expected a system as near to MuJoCo's own step as standing still is, also at the ends of the ranges of "
-            f"its actions and between, got one that is farther off with such an action in {wrong.sum()} of "
-            f"{len(wrong)} states, most of all joint {joint.name or joint.id!r} of body {body.name or body.id!r}: take "
-            f"fewer seconds, or a nominal control (ctrl) near the actions",
+            f"expected a system as near to MuJoCo's own step as standing still is, that moves where MuJoCo does, also "
+            f"at the ends of the ranges of its actions and between, got one that is farther off, or holds still, with "
+            f"such an action in {wrong.sum()} of {len(wrong)} states, most of all joint {joint.name or joint.id!r} of "
+            f"body {body.name or body.id!r}: take fewer seconds, less friction, or a nominal control near the actions",
             ContactWarning,
         )

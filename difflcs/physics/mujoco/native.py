@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -14,7 +14,8 @@ from torch import Tensor
 from difflcs._differentiation import is_wrapped
 from difflcs.errors import InvalidInputError, NonFiniteError
 
-P, R, Array = ParamSpec("P"), TypeVar("R"), NDArray[np.float64]
+Method = TypeVar("Method", bound=Callable[..., Any])
+Array = NDArray[np.float64]
 TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
 """Fields of a caller's data that are used besides the state."""
 
@@ -50,15 +51,15 @@ def to_numpy(tensor: Tensor) -> Array:
     return tensor.cpu().double().numpy()
 
 
-def in_turn(method: Callable[P, R]) -> Callable[P, R]:
+def in_turn(method: Method) -> Method:
     """Let one thread after the other into methods of an object with `_turns`, a lock: MuJoCo's data are its own."""
 
     @functools.wraps(method)
-    def alone(*args: P.args, **options: P.kwargs) -> R:
-        with args[0]._turns:  # pyright: ignore[reportAttributeAccessIssue]
-            return method(*args, **options)
+    def alone(self: Any, *args: Any, **options: Any) -> Any:
+        with self._turns:
+            return method(self, *args, **options)
 
-    return alone
+    return cast(Method, alone)
 
 
 def flags(*names: str) -> int:
