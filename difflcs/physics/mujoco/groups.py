@@ -11,7 +11,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.contacts import Budget, check_pair, find_geoms
 
 Array = NDArray[np.float64]
-_MOST = 1000  # contacts, whose matrices have a gigabyte and more
+_MOST = 2000  # contacts, whose matrices have a gigabyte and more
 
 
 class ContactGroup(NamedTuple):

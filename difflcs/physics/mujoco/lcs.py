@@ -165,8 +165,7 @@ class MujocoLCS:
         budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None and torsion
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
-        random = torch.Generator().manual_seed(0)
-        self._between = torch.rand(_BETWEEN, 1, model.nu, generator=random, dtype=torch.float64)
+        self._parts = torch.rand(_BETWEEN, 1, model.nu, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
@@ -440,7 +439,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
-    parts = of._between.clone()
+    parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
     turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
     u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*of.action_bounds(x))
