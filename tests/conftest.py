@@ -11,7 +11,6 @@ if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, str(max(1, (os.cpu_count() or 1) // workers)))
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -146,22 +145,6 @@ class Build:
             F=G @ G.mT + 0.3 * torch.eye(n_lam, dtype=torch.float64) + H - H.mT,
             c=0.02 * n(n_lam),
         )
-
-    @staticmethod
-    def enumerate_lcp(F: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """λ, w of one P-matrix LCP: the most feasible of all 2ⁿ complementary bases, in scaled units."""
-        n = len(q)
-        scale = F.diagonal().rsqrt()
-        F = scale[:, None] * F * scale
-        size = (scale * q).abs().max().clamp_min(1e-300)
-        q = scale * q / size
-        chosen = torch.from_numpy((np.arange(2**n)[:, None] >> np.arange(n) & 1).astype(bool))
-        M = torch.where(chosen[:, :, None] & chosen[:, None, :], F, torch.eye(n, dtype=F.dtype))
-        lam = torch.linalg.solve_ex(M, torch.where(chosen, -q, 0.0))[0]
-        w = lam @ F.T + q
-        best = torch.minimum(lam, w).amin(1).nan_to_num(nan=-torch.inf).argmax()
-        lam, w = lam[best].clamp_min(0), torch.where(chosen[best], 0.0, w[best]).clamp_min(0)
-        return lam * size * scale, w * size / scale
 
 
 @pytest.fixture(scope="session")

@@ -80,10 +80,10 @@ def finished(tmp_path_factory) -> Any:
 def make_trainer():
     with ExitStack() as opened:
 
-        def make(name: str, larger: bool = False) -> Trainer:
+        def make(name: str, larger: bool = False, seed: int = 0) -> Trainer:
             task, config = make_task(size=2 + larger), make_config(name)
             episodes = round(config.minutes * task.steps_per_minute / STEPS)
-            work = Work(task, 0, episodes, lambda count: opened.enter_context(closing(task.make_envs(count))))
+            work = Work(task, seed, episodes, lambda count: opened.enter_context(closing(task.make_envs(count))))
             return config.method.trainer(work)
 
         yield make
@@ -120,21 +120,16 @@ def test_it_trains_and_says_what_it_did(name, finished):
     assert isinstance(method.version, int)
 
 
-def test_an_iteration_returns_one_of_its_reports_and_counts(name, make_trainer):
+def test_an_iteration_returns_one_of_its_reports_and_counts_and_leaves_global_generators_alone(name, make_trainer):
+    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     trainer = make_trainer(name)
     counted = []
     assert (trainer.iteration, trainer.env_steps) == (0, 0)
-    report = trainer.step(counted.append)
-    assert type(report) in make_config(name).method.reports
-    assert trainer.iteration == report.iteration == 1
-    assert trainer.env_steps == report.env_steps == sum(counted) == trainer.episodes * STEPS
-
-
-def test_the_global_generators_stay_as_they_were(name, make_trainer):
-    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    trainer = make_trainer(name)
-    for _ in range(2):
-        trainer.step()
+    for iteration in (1, 2):
+        report = trainer.step(counted.append)
+        assert type(report) in make_config(name).method.reports
+        assert trainer.iteration == report.iteration == iteration
+        assert trainer.env_steps == report.env_steps == sum(counted) == trainer.episodes * STEPS
     assert torch.equal(before[0], torch.random.get_rng_state())
     assert np.array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002
 
@@ -167,8 +162,9 @@ def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished
     assert timeless[0] == timeless[1]
 
 
-def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(name, finished, tmp_path, monkeypatch):
-    """Die between the row of an iteration and its checkpoint, twice at the same place."""
+def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(finished, tmp_path, monkeypatch):
+    """Die between the row of an iteration and its checkpoint, twice at the same place; rows are not the method's."""
+    name = "violation"
     whole, path, saved = finished(name), tmp_path / "run", []
 
     def dies(root, iteration, state):
@@ -191,10 +187,12 @@ def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(name, finished, tm
 
 
 def test_a_state_decides_everything_that_follows(name, make_trainer):
-    """Whatever a trainer did before, a state decides everything that follows."""
-    one, other = make_trainer(name), make_trainer(name)
+    """Whatever a trainer did before, a state decides everything that follows; and another seed is another training."""
+    one, other, third = make_trainer(name), make_trainer(name), make_trainer(name, seed=1)
     one.step()
     state = copy_state(one.state_dict())
+    third.step()
+    assert not same(*({"tensors": flatten(trainer.state_dict())[0]} for trainer in (one, third)))
     other.step()
     other.step()
     other.load(state)
@@ -204,9 +202,9 @@ def test_a_state_decides_everything_that_follows(name, make_trainer):
     assert same(one.state_dict(), other.state_dict())
 
 
-def test_another_seed_is_another_training(name, finished, tmp_path):
-    other = train(make_config(name, seed=1), tmp_path / "other")
-    assert (other.model / "model.safetensors").read_bytes() != (finished(name).model / "model.safetensors").read_bytes()
+def test_another_seed_is_another_training(finished, tmp_path):
+    other = train(make_config("violation", seed=1), tmp_path / "other").model / "model.safetensors"
+    assert other.read_bytes() != (finished("violation").model / "model.safetensors").read_bytes()
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -258,7 +256,8 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     assert contents(run.path) == files
 
 
-def test_a_run_is_not_continued_with_another_configuration_or_environment(name, finished, tmp_path):
+def test_a_run_is_not_continued_with_another_configuration_or_environment(finished, tmp_path):
+    name = "violation"
     for change in ({"seed": 1}, {"minutes": 3.5}, {"evaluate_goals": 2}):
         with pytest.raises(CheckpointError, match="drop the changes"):
             train(make_config(name, **change), finished(name).path, resume=True)

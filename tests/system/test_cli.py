@@ -6,13 +6,11 @@ import importlib.util
 import io
 import json
 import logging
-import multiprocessing
 import os
 import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -494,7 +492,7 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0  # finished: nothing to lock
 
 
-# --- killed, and disks ------------------------------------------------------------------------------------------------
+# --- disks ------------------------------------------------------------------------------------------------------------
 
 
 def learned(path: Path) -> list[tuple[str, bytes]]:
@@ -502,28 +500,6 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
     last = max(path.glob("checkpoints/0*"))
     files = [path / "model/model.safetensors", last / "model.safetensors", last / "config.json"]
     return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of later versions of Python
-def test_resume_after_kill_9(capsys, tmp_path):
-    """Killed in the warm-up, resumed, killed in the main phase, resumed; a fork has imported what takes seconds."""
-    options = ["--method", "lcs-rl", "--minutes", "1.1", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
-    options += "--ppo.steps 2 --warmup.epochs.first 20 --models.rollouts 4 --models.iterations 1".split()
-    options += ["--final-goals", "0", "--evaluate-at"]
-    through, killed = tmp_path / "through", tmp_path / "killed"
-    for resume, until in ((False, 1), (True, 4)):
-        words = ["train", *options, "--out", str(killed), *["--resume"] * resume]
-        process = multiprocessing.get_context("fork").Process(target=cli.main, args=(words,))
-        process.start()
-        deadline = time.monotonic() + 120
-        while not (killed / f"checkpoints/{until:06d}").exists() and time.monotonic() < deadline:
-            time.sleep(0.005)
-        process.kill()
-        process.join()
-        assert not (killed / "model").exists()
-    assert run(capsys, "train", "--out", killed, "--resume")[0] == 0
-    assert run(capsys, "train", *options, "--out", through)[0] == 0
-    assert learned(through) == learned(killed)
 
 
 @pytest.mark.parametrize("words", ["train --out", "plot cube --out", "render cube --out", "evaluate cube --plot"])

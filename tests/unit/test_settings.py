@@ -14,7 +14,7 @@ import pytest
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
 from difflcs.rl.runs.training import TrainConfig, count_episodes, count_goals_due
-from difflcs.rl.settings import Settings, bounded, from_json, group
+from difflcs.rl.settings import Rollouts, Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
 from tests.conftest import refuse
 
@@ -143,6 +143,8 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
         assert f.name in known, f"{kind.__name__}.{f.name} has no docstring"
         if numbers_in(hints[f.name]):
             assert any(bound is not None for bound in f.metadata.values()), f"{kind.__name__}.{f.name} has no bounds"
+        if f.name in ("n_lam", "width", "networks", "samples", "minutes") or kind is Rollouts:  # what needs memory
+            assert f.metadata["maximum"] is not None, f"{kind.__name__}.{f.name} has no maximum"
 
 
 def test_a_method_stands_for_its_name():
