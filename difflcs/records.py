@@ -203,9 +203,8 @@ class _Record(SystemMatrices):
                 f"every field is shared by the batch; build it from tensors with leading batch dimensions"
             )
         for name, value in self.tensors().items():
-            rank = self._rank(name)
-            if value.ndim > rank:
-                value = value.expand(*batch, *value.shape[value.ndim - rank :])
+            if own := value.ndim - self._rank(name):
+                value = value.expand(*batch, *value.shape[own:])
                 value = index_batch(type(self).__name__, value, batch, index)
             values[name] = value
         return type(self)(**values)

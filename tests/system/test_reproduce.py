@@ -51,6 +51,7 @@ TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), 
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "ours", FIRST)
 SCRATCH = Unit("mug", "lcs-rl", "ours", FIRST)
+QUICK = [Unit(task, "violation", "ours", FIRST) for task in ("cube", "mug")]  # without TorchRL, which takes seconds
 TRANSFER = Unit("mug", "ppo", "ours", FIRST, "cube")
 KNOWN = {task: {"name": task, "source": "ycb_mesh", "sha256": "abc", "mass": 0.05} for task in ("cube", *OBJECTS)}
 TIMES = ["machine", "train_seconds", "evaluation_seconds", "finished"]
@@ -219,15 +220,9 @@ def make_jobs(wanted, work, preset=TINY):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """Results and runs of two units, one starting from the other, computed in this process without interruption."""
-    threads = torch.get_num_threads()
-    jobs = make_jobs([CUBE, TRANSFER], tmp_path_factory.mktemp("undisturbed"))
-    rows = {
-        unit: worker.execute(replace(job, init=job.unit.init and jobs[CUBE].folder / "run"))
-        for unit, job in jobs.items()
-    }
-    torch.set_num_threads(threads)
-    return rows, jobs
+    """Results and runs of two units, computed in this process without interruption."""
+    jobs = make_jobs(QUICK, tmp_path_factory.mktemp("undisturbed"))
+    return {unit: worker.execute(job) for unit, job in jobs.items()}, jobs
 
 
 def assert_same(jobs, undisturbed):
@@ -251,11 +246,11 @@ def local():
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of a killed Dask worker
 def test_a_killed_worker_costs_nothing_but_time(local, undisturbed, tmp_path):
-    jobs, stored, created = make_jobs([CUBE, TRANSFER], tmp_path), [], []
+    jobs, stored, created = make_jobs(QUICK, tmp_path), [], []
 
     def kill(pid):
-        # As soon as the first iteration is on disk. The rest of the unit, TorchRL's import included, takes longer.
-        run, deadline = jobs[CUBE].folder / "run", time.monotonic() + 240
+        # As soon as the first iteration is on disk. The rest of the unit takes longer.
+        run, deadline = jobs[QUICK[0]].folder / "run", time.monotonic() + 240
         latest = run / "checkpoints" / "latest.json"
         while not latest.is_file() or json.loads(latest.read_text())["checkpoint"] == "000000":
             if time.monotonic() > deadline:
@@ -270,7 +265,7 @@ def test_a_killed_worker_costs_nothing_but_time(local, undisturbed, tmp_path):
     failed = runs.compute(list(jobs.values()), local, stored.append, quietly()[0])
     killer.join()
     assert not failed
-    assert created == [(jobs[CUBE].folder / "run" / "config.json").stat().st_mtime_ns]  # resumed, not begun again
+    assert created == [(jobs[QUICK[0]].folder / "run" / "config.json").stat().st_mtime_ns]  # resumed, not begun again
     assert_same(jobs, undisturbed)
     assert [rows.task[0] for rows in stored] == ["cube", "mug"]
     # All is finished: nothing is computed again.
@@ -640,8 +635,10 @@ def test_the_task_is_drawn(undisturbed, tmp_path, monkeypatch, capsys):
         _make_gl_context(64, 64).free()
     except RenderingError as error:
         pytest.skip(f"needs OpenGL: {error}")
-    job = undisturbed[1][CUBE]
+    job = make_jobs([CUBE], tmp_path / "work")[CUBE]
+    played()(job)
     assert fig_task.newest(job.work) == job.folder / "run"
+    job = undisturbed[1][QUICK[0]]
     code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--run", job.folder / "run")
     assert code == 0, err
     assert f"model: {job.folder / 'run'}" in out

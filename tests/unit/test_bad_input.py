@@ -93,7 +93,10 @@ def entry(build, name, model):
         "violation_loss": lambda: (lambda **t: violation_loss(model, **t), {"x": x, "u": u, "x_next": x}),
         "prediction_loss": lambda: (lambda **t: prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
         "forward": lambda: (model, {"x": x, "u": u}),
-        "rollout": lambda: (model.rollout, {"x0": x, "u_seq": n(5, 3, 2)}),
+        "rollout": lambda: (
+            lambda **t: (model.rollout(**t), model.params().rollout(**t)),
+            {"x0": x, "u_seq": n(5, 3, 2)},
+        ),
         "QuadraticCost": lambda: (QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
         "GoalCost": lambda: (reach, {"goal": goal}),
         "layer": lambda: (lambda **t: layer(build, **t), limits),
@@ -369,7 +372,6 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
     "StageBounds": (lambda b, u_min=LOW, u_max=None: StageBounds(u_min, u_max), [
         ({"u_min": full(0.1, 3, 2), "u_max": full(-0.1, 3, 2)}, e.BoundsError,
          r"u_min <= u_max, got 0.1 and -0.1 at index \(0, 0\)"),
-        ({"u_min": full(0.1, 3, 2), "u_max": 0.0}, e.BoundsError, "u_min <= u_max, got 0.1 and 0"),
         ({"u_min": full(INF, 3, 2)}, e.BoundsError, "u_min: expected at least one action that it allows"),
         ({"u_min": full(-1.0, 2), "u_max": full(1.0, 3, 2)}, e.ShapeError,
          r"u_min: expected a dimension of stages.*got \(2,\)"),
@@ -378,7 +380,6 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"u_max": full(1.0, 3, 3)}, e.ShapeError, r"u_m..: expected shape \(\.\.\., H=3, n_u="),
         ({"u_min": full(NAN, 3, 2)}, e.NonFiniteError, "u_min: expected numbers or infinity, got 6 NaN of 6"),
         ({"u_min": -1.0, "u_max": 1.0}, e.InvalidInputError, "by_stage: expected at least one field by stage"),
-        ({"u_min": torch.zeros(3, 2, dtype=torch.int64)}, e.DTypeError, "u_min: expected float32 or float64"),
         ({"u_max": "1"}, e.DTypeError, "u_max: expected a torch.Tensor, got str"),
     ]),
     "LinearConstraints": (rows, [
@@ -392,11 +393,9 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"weight": NAN}, e.NonFiniteError, "weight: expected numbers or infinity, got 3 NaN"),
         ({"weight": True}, e.DTypeError, "weight: expected a torch.Tensor, got bool"),
         ({"G": full(NAN, 3, 4)}, e.NonFiniteError, "G: expected finite numbers, got 12"),
-        ({"G": full(INF, 3, 4)}, e.NonFiniteError, "G: expected finite numbers, got 12"),
         ({"E": full(INF, 3, 2)}, e.NonFiniteError, "E: expected finite numbers, got 6"),
         ({"g": full(NAN, 3)}, e.NonFiniteError, "g: expected numbers or infinity, got 3 NaN"),
         ({"g": [1.0, [1.0], True]}, e.DTypeError, "g: expected a torch.Tensor, got list"),
-        ({"G": torch.ones(3, 4, dtype=torch.int64)}, e.DTypeError, "G: expected float32 or float64"),
         ({"G": None}, e.DTypeError, "G: expected a torch.Tensor, got NoneType"),
     ]),
     "ConstraintSequence": (rows_by_stage, [
@@ -430,13 +429,10 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"pairs": [(1, 1)]}, e.InvalidInputError, r"pairs: .*different indices.*\(1, 1\)"),
         ({"pair_weight": -2.0}, e.InvalidInputError, "pair_weight: .*got -2"),
         ({"n_x": 0}, e.InvalidInputError, "n_x: expected at least 1, got 0"),
-        ({"n_u": 1.5}, e.DTypeError, "n_u: expected an int, got float 1.5"),
         ({"dtype": torch.float16}, e.DTypeError, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
     ]),
     "LCSModel": (lambda b, support=SUPPORT: LCSModel(4, 2, 3, action_support=support), [
         ({"support": SUPPORT[0]}, e.ShapeError, "action_support|u_min"),
-        ({"support": SUPPORT.expand(3, 2, 2)}, e.ShapeError, "action_support|u_min"),
-        ({"support": SUPPORT[:, :1]}, e.ShapeError, "action_support|u_min"),
         ({"support": SUPPORT.flip(0)}, e.BoundsError, "action_support|u_min"),
         ({"support": SUPPORT * NAN}, e.NonFiniteError, "action_support|u_min"),
         ({"support": [[0.0, 0.0], [1.0, 1.0]]}, e.DTypeError, "action_support|u_min"),

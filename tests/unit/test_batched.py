@@ -32,6 +32,11 @@ def diagonal(*weights):
     return torch.diag(torch.tensor(weights, dtype=torch.float64))
 
 
+def upright(horizon):
+    cost = QuadraticCost(diagonal(1, 1, 0.1, 0.1), diagonal(0.01), diagonal(100, 100, 1, 1))
+    return LCSMPCLayer(cart_pole_between_walls(), cost, horizon, -10.0, 10.0)
+
+
 def costs(mpc, *call, **options):
     """The costs of plans by other options of the backend; all of them are solved."""
     mpc.backend = BatchedBackend(**options)
@@ -149,8 +154,7 @@ def test_more_effort_finds_better_optima(build, n_lam):
 
 def test_an_unstable_plant_starts_from_its_feedback_law():
     """Without action the pole falls onto a wall, and from there every step leads to leaning on it."""
-    cost = QuadraticCost(diagonal(1, 1, 0.1, 0.1), diagonal(0.01), diagonal(100, 100, 1, 1))
-    mpc = LCSMPCLayer(cart_pole_between_walls(), cost, 50, -10.0, 10.0)
+    mpc = upright(50)
     size = torch.tensor([0.02, 0.05, 0.1, 0.3], dtype=torch.float64)
     x0 = size * (2 * torch.rand(32, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1)
     assert float((costs(mpc, x0) <= 1.001 * costs(mpc, x0, restarts=32)).double().mean()) >= 0.9
@@ -170,8 +174,7 @@ def carts(count, dt, gap, softness, damping=0.0, walls=True):
 
 def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
     """Every start holds an upright pole; one that falls onto a wall has more optima."""
-    cost = QuadraticCost(diagonal(1, 1, 0.1, 0.1), diagonal(0.01), diagonal(100, 100, 1, 1))
-    mpc = LCSMPCLayer(cart_pole_between_walls(), cost, 30, -10.0, 10.0)
+    mpc = upright(30)
     x0 = torch.tensor([[0.01, 0.01, 0.0, 0.0], [0.3, 0.6, 0.0, 2.0]], dtype=torch.float64)
     iterations = {}
     for restarts in (8, 16):

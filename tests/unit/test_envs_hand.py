@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 import difflcs_envs  # noqa: F401
 from difflcs.rl.tasks import get_task
 from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation
-from difflcs_envs.hand.model import FINGERS, LINKS, OBJECTS, PALM_TOP
+from difflcs_envs.hand.model import FINGERS, LINKS, OBJECTS, PALM_TOP, POSTURE
 from difflcs_envs.hand.task import rotation_to_quaternion
 from difflcs_envs.tasks import hand_cost, hand_system
 
@@ -34,6 +34,21 @@ def test_the_object_rests_on_the_palm_within_open_fingers(name):
     assert after["state"][18] == pytest.approx(PALM_TOP + OBJECTS[name][2], abs=2e-3)
     assert min(contact.dist for contact in env.data.contact) > -2e-3
     assert env.describe() == {"name": name, "mass": pytest.approx(0.07), "friction": 0.4, "servo_gain": 2.0}
+
+
+def test_the_fingers_are_those_of_the_allegro_hand():
+    """Where the tips are at the start and stretched out; sums of how far joints go, how thick and long links are."""
+    data = mujoco.MjData(model := make().model)
+    tips = [[-15.9, -48.8, 52.1], [37.5, 1.2, 62.3], [-39.0, 64.3, 48.5], [-89.2, 8.2, 50.7]]
+    stretched = [[133.4, -55.3, 0.0], [136.2, 0.0, 0.0], [133.4, 55.3, 0.0], [-86.1, -167.7, -13.2]]
+    for posture, places in ((POSTURE, tips), ([0.0] * 16, stretched)):
+        data.qpos[:16] = posture
+        mujoco.mj_kinematics(model, data)
+        found = [1000 * data.site(f"{finger}_tip").xpos for finger in FINGERS]  # [mm]
+        np.testing.assert_allclose(found, places, atol=0.1)
+    np.testing.assert_allclose(model.jnt_range[:16].sum(0), [-3.394, 23.143], atol=1e-9)
+    sizes = sum(model.geom(f"{finger}_{link}").size for finger in FINGERS for link in LINKS)
+    np.testing.assert_allclose(sizes, [0.1825, 0.28317, 0.0], atol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "size", "volume"), [("house", (50, 40, 50), 82.5), ("nut", (60, 51.96, 40), 93.53)])

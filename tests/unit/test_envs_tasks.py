@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -39,6 +40,9 @@ def test_its_step_and_its_names_are_those_of_the_environment(name):
     assert [q.name for q in task.goal] == ["x", "y", "yaw"]
     info = env.reset(seed=0)[1]
     assert task.say(info) == caption(info)
+    goals = np.array(task.example_goals)  # which show different pushes, and turns to both sides
+    assert name == "turn_cube" or min(np.hypot(*(a - b)[:2]) for a, b in combinations(goals, 2)) > 0.05
+    assert goals[:, 2].min() < 0 < goals[:, 2].max()
     env.close()
 
 

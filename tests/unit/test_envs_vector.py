@@ -2,6 +2,7 @@
 
 import multiprocessing
 import pickle
+import sys
 import warnings
 
 import gymnasium
@@ -185,6 +186,14 @@ def test_bad_actions(actions):
         envs.step(actions)
     with pytest.raises(ValueError, match="2 seeds"):
         envs.reset(seed=[1, 2, 3])
+
+
+def test_torchrl_that_is_missing_is_named(monkeypatch):
+    from difflcs_envs.torchrl import make_env
+
+    monkeypatch.setitem(sys.modules, "torchrl.envs", None)
+    with pytest.raises(difflcs_envs.MissingDependencyError, match="torchrl"):
+        make_env("cube")
 
 
 @pytest.mark.parametrize(("task", "arguments"), [("cube", {}), ("clamp", {"object_source": "stand_in"}), (TURN, {})])

@@ -1,4 +1,4 @@
-"""The layer under torch.func: the numbers of plain calls, or an error. Jacobians and torch.compile: test_transforms."""
+"""The layer under torch.func: the numbers of plain calls, or an error. What all solvers share: test_transforms."""
 
 import warnings
 from functools import partial
@@ -35,17 +35,6 @@ def systems(build):
 
 def close(found, expected):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11, check_stride=False)
-
-
-def test_vmap_is_a_batch(layer, x0):
-    plain = layer(x0)
-    close(vmap(lambda x: layer(x).u)(x0), plain.u)
-    close(vmap(lambda x: layer(x).objective, in_dims=1)(x0.T), plain.objective)
-    close(vmap(lambda x: layer(x).u, out_dims=1)(x0), plain.u.transpose(0, 1))
-    assert torch.equal(vmap(lambda x: layer(x).status)(x0), plain.status)
-    close(vmap(vmap(lambda x: layer(x).u))(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
-    close(vmap(lambda x: layer(x).u, chunk_size=4)(x0), plain.u)
-    close(vmap(lambda x: layer(x).u)(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
 
 
 def test_vmap_over_systems_states_and_both(build, layer, x0, systems):
@@ -109,23 +98,6 @@ def test_failures_are_reported_inside(layer, x0):
         found = vmap(grad(lambda x: layer(x).u.sum()))(bad)
     assert torch.equal(found[1], torch.zeros(4, dtype=torch.float64))
     assert float(found[[0, 2]].detach().abs().amax(1).min()) > 0
-
-
-def test_grad_is_backward(layer, x0):
-    leaf = x0.clone().requires_grad_()
-
-    def loss(x):
-        solution = layer(x)
-        return solution.u.square().sum() + solution.objective.sum() + solution.x.sum() + solution.lam.sum()
-
-    (plain,) = torch.autograd.grad(loss(leaf), leaf)
-    close(grad(loss)(x0), plain)
-    close(vmap(grad(loss))(x0), plain)
-    close(grad(lambda x: vmap(loss)(x).sum())(x0), plain)
-    mapped = vmap(loss)(leaf).sum()
-    close(torch.autograd.grad(mapped, leaf)[0], plain)
-    close(vmap(vmap(grad(loss)))(x0.reshape(3, 2, 4)), plain.reshape(3, 2, 4))
-    close(vmap(grad(loss), in_dims=1, out_dims=1)(x0.T), plain.T)
 
 
 def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):

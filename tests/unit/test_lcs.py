@@ -28,13 +28,6 @@ def test_a_new_model_has_the_documented_start():
     assert not LCSModel(9, 6, 5, learn_c=False).c.requires_grad
 
 
-def test_the_generator_alone_decides_the_start():
-    first, second, other = (LCSModel(3, 2, 2, generator=torch.Generator().manual_seed(s)) for s in (7, 7, 8))
-    assert torch.equal(first.A, second.A)
-    assert torch.equal(first.H, second.H)
-    assert not torch.equal(first.A, other.A)
-
-
 @pytest.mark.parametrize("stiffness", [None, 1e-3])
 @pytest.mark.parametrize("n_lam", [1, 3, 6])
 def test_from_params_round_trip(build, stiffness, n_lam):

@@ -162,15 +162,6 @@ def test_learned_bounds_at_the_action_support_have_their_gradient(build, x0):
         torch.testing.assert_close(bound.grad, gradient, rtol=1e-9, atol=1e-12)
 
 
-def test_equal_bounds_fix_the_action(layer, x0):
-    fixed = torch.tensor([0.05, -0.02], dtype=torch.float64, requires_grad=True)
-    solution = layer(x0, u_min=fixed, u_max=fixed)
-    assert bool(solution.converged.all())
-    torch.testing.assert_close(solution.u.detach(), fixed.detach().expand(6, 3, 2), rtol=0, atol=1e-12)
-    (gradient,) = torch.autograd.grad(solution.action[:, 0].sum(), fixed)
-    torch.testing.assert_close(gradient, torch.tensor([6.0, 0.0], dtype=torch.float64))
-
-
 # --- failures -------------------------------------------------------------------------------------------------------
 
 

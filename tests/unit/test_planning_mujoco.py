@@ -62,6 +62,18 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
     refuse(InvalidInputError, "effector: expected at most 0, got 1", places.ring, x, 1, 0.1)
 
 
+def test_joints_that_move_are_driven_to_where_they_come_to_rest():
+    """In two steps, as long as what is no longer driven goes on."""
+    model = mujoco.MjModel.from_xml_string(WORLD.format(SLIDES, '<motor joint="a"/><motor joint="b"/>'))
+    module = MujocoLCS(model, motion="dynamic", seconds=0.1)
+    places = BodyPlaces(module, "box", ["tip"], 12, gap=0.005)
+    x = module.observe(mujoco.MjData(model))
+    x[8:] = torch.tensor([0.02, -0.01])
+    target = x + 0.01 * torch.eye(10, dtype=x.dtype)[3]
+    after = module.params(x).step(x, BodyTravel(places, clearance=0.03, step=9.0).action(x, target)).x_next
+    torch.testing.assert_close(after[3:5] + 2 * 0.1 * after[8:], target[3:5], rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("controls", "options", "chosen", "tried"),
     [

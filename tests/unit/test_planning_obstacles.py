@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSMPCLayer
-from difflcs.errors import ShapeError
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PlanarPushing, Union, box
 from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, Obstacles, PlanarTravel
 from difflcs.planning.outline import clearance
-from tests.conftest import F64, tensor
+from tests.conftest import F64, refuse, tensor
 
 BODY, RADIUS = box(-0.5, 0.5, -0.5, 0.5), 0.1
 WALL, BALL, TEE = box(-0.1, 0.1, -2.0, 2.0), Circle(0.4), Union((box(-0.6, 0.6, 0, 0.3), box(-0.2, 0.2, 0.3, 1.0)))
@@ -61,6 +61,8 @@ def test_a_plan_leaves_the_margin_and_exists_where_body_and_wall_overlap(wall, r
 def test_nothing_in_the_way_or_near_makes_no_constraints():
     obstacles = Obstacles(BODY, RADIUS)
     x = tensor([[0.0, 0.0, 0.0, -0.61, 0.0]])
+    assert obstacles.margin == pytest.approx(RADIUS / 3)
+    refuse(InvalidInputError, "margin: expected", Obstacles, BODY, RADIUS, margin=0.0)
     assert obstacles.constraints(x) is None
     assert obstacles.gap(x[:, :2]).isinf().all()
     assert placed((BALL, [9.0, 0.0, 0.0])).constraints(x) is None

@@ -45,29 +45,6 @@ def test_vmap_solves_what_a_loop_solves(lcps, relaxation, in_dims):
             assert torch.equal(value[i], expected)
 
 
-@exact_and_relaxed
-def test_grad_is_the_gradient_of_backward(lcps, relaxation):
-    F, q = lcps
-
-    def total(F, q):
-        lam, w, _ = solve_lcp(F, q, relaxation)
-        return (lam.square() + 3 * w.sin()).sum()
-
-    def mapped(F, q):
-        return vmap(total, (None, 0))(F, q).sum()
-
-    shared, points = F[0].clone().requires_grad_(), q.clone().requires_grad_()
-    total(shared, points).backward()
-    for function in (total, mapped):
-        found = grad(function, (0, 1))(F[0], q)
-        torch.testing.assert_close(found, (shared.grad, points.grad), rtol=1e-12, atol=1e-14)
-    each = vmap(grad(total), (None, 0))(F[0], q)  # gradients of each problem for the F that they share
-    torch.testing.assert_close(each.sum(0), shared.grad, rtol=1e-12, atol=1e-14)
-    alone = vmap(grad(total, (0, 1)))(F, q)
-    for i in range(COUNT):
-        torch.testing.assert_close(tuple(v[i] for v in alone), grad(total, (0, 1))(F[i], q[i]), rtol=1e-12, atol=1e-14)
-
-
 def test_a_gradient_inside_an_outer_graph_is_a_gradient_of_it(lcps):
     """torch.func.grad inside code that is differentiated for something else, on which the inner gradient is linear."""
     F, q = lcps
@@ -100,6 +77,7 @@ def function(build, lcps, data, what):
     (F, q), (x, u, x_next), model = lcps, data, build.model(seed=3)
     if "LCP" in what:
         relaxation = 1e-3 if "relaxed" in what else 0.0
+        F = F[0] if "shared" in what else F
         return (lambda F: solve_lcp(F, q).lam, F[0]) if "F" in what else (lambda q: solve_lcp(F, q, relaxation).lam, q)
     if what == "layer":
         layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
@@ -118,6 +96,34 @@ def test_every_way_to_a_jacobian_gives_the_same(function):
     rows = torch.stack([pull(row)[0] for row in basis]).reshape(expected.shape)
     for found in (jacobian(of, at, vectorize=True), jacrev(of)(at), jacrev(of, chunk_size=1)(at), rows):
         torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("what", ["shared LCP", "shared relaxed LCP", "layer"])
+def test_vmap_is_a_batch_and_grad_is_backward(function):
+    (of, at), leaf = function, function[1].clone().requires_grad_()
+
+    def total(z):
+        return (of(z).square() + 3 * of(z).sin()).sum()
+
+    plain, (slope,) = of(at).detach(), torch.autograd.grad(total(leaf), leaf)
+    fold, grid = (lambda v: v.flatten(0, 1)), at.reshape(2, 3, 4)
+    values = [vmap(of)(at), vmap(of, 1)(at.T), vmap(of, out_dims=1)(at).mT, vmap(of, chunk_size=4)(at)]
+    for found in (*values, fold(vmap(of)(grid)), fold(vmap(vmap(of))(grid))):
+        torch.testing.assert_close(found.detach(), plain, rtol=1e-9, atol=1e-11, check_stride=False)
+    mapped = torch.autograd.grad(vmap(total)(leaf).sum(), leaf)[0]
+    slopes = [grad(total)(at), vmap(grad(total))(at), grad(lambda z: vmap(total)(z).sum())(at), mapped]
+    for found in (*slopes, fold(vmap(vmap(grad(total)))(grid)), vmap(grad(total), 1, 1)(at.T).T):
+        torch.testing.assert_close(found, slope, rtol=1e-9, atol=1e-11, check_stride=False)
+
+
+def test_gradients_of_problems_sum_to_that_of_the_matrix_that_they_share(lcps):
+    F, q = lcps
+
+    def total(F, q):
+        return solve_lcp(F, q).lam.square().sum()
+
+    each = vmap(grad(total), (None, 0))(F[0], q)
+    torch.testing.assert_close(each.sum(0), grad(total)(F[0], q), rtol=1e-12, atol=1e-14)
 
 
 @every_function

@@ -260,9 +260,9 @@ def evaluate_nominal(at: Situation) -> Nominal:
         return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.delayed))
     nominal, velocity = _evaluate(at, np.zeros(len(step.x), dtype=bool))
     if rows.gap.size and contacts.gap.size:
-        mass = 1 / np.diagonal(step.inverse_mass, axis1=1, axis2=2)
+        inverse = np.diagonal(step.inverse_mass, axis1=1, axis2=2)
         speeds = step.velocity, step.reached(np.zeros_like(step.delayed))[1], velocity
-        before, alone, after = (np.sqrt((mass * v * v).sum(-1)) for v in speeds)
+        before, alone, after = (np.sqrt((v * v / inverse).sum(-1)) for v in speeds)
         jams = after > _GAINS * (before + alone)
         if jams.any():
             nominal, _ = _evaluate(at, jams)

@@ -260,22 +260,23 @@ def shift(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
         return layer(x0).shift()
 
 
-def opposite(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
-    """The vertex opposite to its own plan, and λ with the roles of λ and s exchanged."""
-    with torch.no_grad():
-        plan = layer(x0)
-    low, high = (torch.as_tensor(v).expand_as(plan.u[:, 0]).unsqueeze(1) for v in (layer.u_min, layer.u_max))
-    u = torch.where(plan.u - low > high - plan.u, low, high).to(plan.u.dtype)
-    return Primal(plan.x, u, (problem.relaxation / plan.lam.clamp_min(1e-30)).clamp_max(1e30))
+def _from_other_actions(actions, forces=lambda problem, lam: lam):
+    def guess(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
+        with torch.no_grad():
+            plan = layer(x0)
+        low, high = (torch.as_tensor(v).expand_as(plan.u[:, 0]).unsqueeze(1) for v in (layer.u_min, layer.u_max))
+        u = actions(plan.u, low, high).expand_as(plan.u).to(plan.u.dtype)
+        return Primal(plan.x, u, forces(problem, plan.lam))
+
+    return guess
 
 
-def interior(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
-    """Actions in the middle of their ranges."""
-    with torch.no_grad():
-        plan = layer(x0)
-    low, high = (torch.as_tensor(v).expand_as(plan.u[:, 0]).unsqueeze(1) for v in (layer.u_min, layer.u_max))
-    u = (0.37 * low + 0.63 * high).expand_as(plan.u).to(plan.u.dtype)
-    return Primal(plan.x, u, plan.lam)
+# The vertex opposite to its own plan, and λ with the roles of λ and s exchanged; actions in the middle of their ranges.
+opposite = _from_other_actions(
+    lambda u, low, high: torch.where(u - low > high - u, low, high),
+    lambda problem, lam: (problem.relaxation / lam.clamp_min(1e-30)).clamp_max(1e30),
+)
+interior = _from_other_actions(lambda u, low, high: 0.37 * low + 0.63 * high)
 
 
 def mpc_target(
