@@ -306,15 +306,29 @@ class TaskSpec:
                 if self.threaded and threads is not None:
                     arguments["threads"] = threads
                 envs = gymnasium.make_vec(self.env, num_envs=count, **arguments)
+        return self.narrow(envs)
+
+    def narrow(self, envs: VectorEnv) -> VectorEnv:
+        """Make the bounds of the task the action space of environments, which are closed if they do not fit.
+
+        So nothing is executed beyond the bounds: no random action, and no noise.
+        """
         try:
-            self._check_spaces(envs.single_observation_space, envs.single_action_space)
+            space: Any = self._check_spaces(envs.single_observation_space, envs.single_action_space)
         except InvalidInputError:
             envs.close()
             raise
+        from gymnasium.vector.utils import batch_space
+
+        envs.single_action_space, envs.action_space = space, batch_space(space, envs.num_envs)
         return envs
 
-    def _check_spaces(self, seen: Any, space: Any) -> None:
-        """Raise if spaces of the environment have other sizes than the cost, or it would clip the planned actions."""
+    def _check_spaces(self, seen: Any, space: Any) -> Any:
+        """Return the space of actions within the bounds.
+
+        Raises:
+            InvalidInputError: spaces of the environment have other sizes, or it would clip the planned actions.
+        """
         shapes = {name: one.shape for name, one in getattr(seen, "spaces", {}).items()}
         for name, size in (("state", self.n_x), ("goal", self.n_goal)):
             if shapes.get(name) != (size,):
@@ -335,6 +349,8 @@ class TaskSpec:
                 f"what is outside, got {low.tolist()} to {high.tolist()} and {least.tolist()} to {most.tolist()}; "
                 f"narrow the bounds, or widen the space"
             )
+        low, high = (bound.clamp(least, most).numpy().astype(space.dtype) for bound in self.bounds)
+        return type(space)(low, high, dtype=space.dtype)
 
     @contextmanager
     def _making(self) -> Iterator[dict[str, Any]]:

@@ -12,7 +12,7 @@ import torch
 
 from difflcs import GoalCost, LCSModel
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.rl.rollout import PolicyOutput
+from difflcs.rl.rollout import PolicyOutput, collect, noisy_actions, uniform_actions
 from difflcs.rl.runs.figures import record_video
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
@@ -68,7 +68,10 @@ def test_environments_that_cannot_be_made_say_why():
 )
 def test_an_environment_that_would_clip_what_is_planned_is_refused(change, message):
     refuse(InvalidInputError, message, make_task(**change).make_envs, 2)
-    make_task(u_max=U_MAX / 2).make_envs(2).close()  # narrower ones are executed as planned
+    envs, random = make_task(u_max=U_MAX / 2).make_envs(2), np.random.default_rng(0)  # narrower ones hold for all
+    action = collect(envs, noisy_actions(uniform_actions(envs, random), 1.0, random), [0, 1], STEPS)["action"]
+    assert action.max() == U_MAX / 2
+    envs.close()
 
 
 def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path, monkeypatch):

@@ -269,7 +269,7 @@ class _Training:
         state = load_checkpoint(run.checkpoints) if started else None
 
         def open_envs(count: int) -> VectorEnv:
-            self.opened.append(self.make_envs(count))
+            self.opened.append(self.task.narrow(self.make_envs(count)))
             _record_object(run, self.task.describe(self.opened[-1]))
             return self.opened[-1]
 
