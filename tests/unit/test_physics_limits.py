@@ -26,6 +26,7 @@ STRING = """<site name="hook" pos="0 0 1"/><body pos=".1 0 .8"><freejoint/><site
   <geom size=".02" mass=".3"/></body>"""
 CORD = '<tendon><spatial limited="true" range="0 .3" {}><site site="hook"/><site site="eye"/></spatial></tendon>'
 FIXED = '<tendon><fixed limited="true" range="-1 {}" {}><joint joint="j" coef="1"/></fixed></tendon>'
+STILL = '<site name="hook"/><site name="eye" pos=".1 0 0"/>'
 MOTOR = '<actuator><motor joint="j"/></actuator>'
 RESTING = {
     "drawer": (DRAWER.format(""), ""),
@@ -38,6 +39,7 @@ RESTING = {
     "tendon": (hinge(), FIXED.format(".5", "")),
     "friction": (hinge('frictionloss="3"'), ""),
     "friction of a tendon": (hinge(), FIXED.format("9", 'frictionloss="3"')),
+    "a cord that nothing moves": (hinge('range="-10 10"') + STILL, CORD.format('frictionloss="1"')),
     "friction of a slide under a box": (DRAWER.format('frictionloss="60"') + BOX, ""),
 }
 

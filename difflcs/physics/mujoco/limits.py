@@ -340,8 +340,8 @@ def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float,
     coarse = count > _MOST_STEPS
     count = min(count, _MOST_STEPS)
     h, limit = seconds / count, np.isinf(soft.bound)
-    free, drag, turn, mass = load
-    upper, slower = np.maximum(mass, 1e-300) * soft.bound, 1 + h * drag
+    free, drag, turn, mass = load._replace(mass=np.maximum(load.mass, 1e-300))
+    upper, slower = mass * soft.bound, 1 + h * drag
     lower = np.where(limit, 0.0, -upper)
     r, v, held, holds = gap.copy(), speed.copy(), np.ones_like(limit), np.ones_like(limit)
     way = np.zeros((2, *gap.shape))  # by the force, and by the load

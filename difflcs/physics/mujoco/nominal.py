@@ -217,7 +217,7 @@ def _settle(at: Situation, at_once: NDArray[np.bool_]) -> tuple[ScaledRows, Arra
         return scale(rows, rows.gap, 1.0, response, give, h), rows.normal
     # First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
     speed = (rows.normal @ step.velocity[:, :, None])[:, :, 0]
-    creeps = np.abs(speed) < rows.soft.bound * rows.soft.yields(1.0, np.inf)
+    creeps = np.abs(speed) < np.where(is_limit, 0.0, rows.soft.bound) * rows.soft.yields(1.0, np.inf)
     gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
     scaled = scale(rows, gap, 1.0, response, give, h)
     rays = at.rays(contacts, scaled, step.response)
