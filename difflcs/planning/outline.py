@@ -10,7 +10,7 @@ from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int
 from difflcs.errors import InvalidInputError
-from difflcs.physics.shapes import Shape, is_inside, shoelace
+from difflcs.physics.shapes import Polygon, Shape, shoelace
 
 _CELLS = 160
 
@@ -77,8 +77,7 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
         if not curves:
             raise InvalidInputError(f"distance: expected one that numbers can hold, got {distance:g}; take a smaller")
         curve = max(curves, key=lambda curve: float(shoelace(curve).sum()))
-        sides = curve.roll(-1, 0) - curve
-        apart = sum(not bool(is_inside(other[0] - curve, sides)) for other in curves if other is not curve)
+        apart = sum(not bool(Polygon(curve).contains(other).all()) for other in curves if other is not curve)
         if apart:
             raise InvalidInputError(
                 f"shape: expected parts that one curve at distance {distance:g} goes round, got {apart + 1} that are "

@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from difflcs.physics.mujoco import MujocoLCS
+from tests.conformance.hostile.campaign import fill
 from tests.conformance.scenes import judge_seeds
 
 KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
@@ -275,10 +276,7 @@ def main() -> None:
     )
     options, text = judge_seeds(parser, judge, table)
     if options.fill:
-        head, rest = options.fill.read_text().split("<!-- gaps: begin -->")
-        options.fill.write_text(
-            f"{head}<!-- gaps: begin -->\n{text}\n<!-- gaps: end -->{rest.split('<!-- gaps: end -->')[1]}"
-        )
+        fill(options.fill, "gaps", text)
 
 
 if __name__ == "__main__":

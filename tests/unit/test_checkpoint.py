@@ -3,9 +3,6 @@
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -147,39 +144,6 @@ def test_log_has_no_doubled_nor_broken_rows(tmp_path):
 
 
 # --- locks ------------------------------------------------------------------------------------------------------------
-
-HOLD = """
-import sys, time, pathlib
-from difflcs.rl.runs.checkpoint import RunDirectory
-with RunDirectory(pathlib.Path(sys.argv[1])).locked():
-    print("locked", flush=True)
-    time.sleep(60)
-"""
-
-
-@pytest.fixture
-def holder(tmp_path):
-    """Another process that holds the lock of a directory."""
-    with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout.readline() == "locked\n"
-            yield process
-        finally:
-            process.kill()
-
-
-@pytest.mark.slow
-def test_a_run_in_use_is_refused_until_its_process_dies(tmp_path, holder):
-    run = RunDirectory(tmp_path)
-    with pytest.raises(InUseError, match=r"in use; wait until .* another --out") as error, run.locked():
-        pass
-    assert str(tmp_path) in str(error.value)
-    os.kill(holder.pid, signal.SIGKILL)
-    holder.wait()
-    assert (tmp_path / ".lock").exists()  # left behind, and no obstacle
-    with run.locked():
-        pass
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_lock_moves_with_its_directory(tmp_path):

@@ -233,7 +233,7 @@ def test_a_folder_that_cannot_be_written(server, tmp_path):
         fetch(server, tmp_path)
 
 
-# --- several processes: how they wait is in test_envs_objects.py ------------------------------------------------------
+# --- several processes ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -1,10 +1,7 @@
-"""Settings: types, bounds and groups; what `difflcs train` takes, all of it documented and bounded."""
+"""Settings: types, bounds and groups; what `difflcs train` takes, all of it bounded."""
 
-import ast
-import inspect
 import json
 import math
-import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any, Literal, get_args, get_type_hints
@@ -116,31 +113,16 @@ def all_groups() -> list[type[Any]]:
     return [TrainConfig, *found]
 
 
-def described(kind: type[Any]) -> set[str]:
-    """Fields with a docstring below them, in this class or one that it inherits from."""
-    found: set[str] = set()
-    for base in kind.__mro__:
-        if not is_dataclass(base) or base.__module__ == __name__:
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        assert isinstance(body, ast.ClassDef)
-        for node, below in zip(body.body, body.body[1:], strict=False):
-            text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-            if isinstance(node, ast.AnnAssign) and text and str(below.value.value).strip():
-                found.add(ast.unparse(node.target))
-    return found
-
-
 def numbers_in(hint: Any) -> bool:
     return hint in (int, float) or any(numbers_in(part) for part in get_args(hint) if not isinstance(part, str))
 
 
 @pytest.mark.parametrize("kind", all_groups(), ids=lambda kind: kind.__name__)
-def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind):
+def test_every_setting_that_is_a_number_has_bounds(kind):
+    """That each says what it is, docs/generated.py asks for."""
     assert issubclass(kind, Settings)
-    hints, known = get_type_hints(kind), described(kind)
+    hints = get_type_hints(kind)
     for f in fields(kind):
-        assert f.name in known, f"{kind.__name__}.{f.name} has no docstring"
         if numbers_in(hints[f.name]):
             assert any(bound is not None for bound in f.metadata.values()), f"{kind.__name__}.{f.name} has no bounds"
         if f.name in ("n_lam", "width", "networks", "samples", "minutes") or kind is Rollouts:  # what needs memory

@@ -193,15 +193,13 @@ def markdown(records: list[Record]) -> str:
 
 
 PAGE = Path("docs/promises.md")
-BEGIN, END = "<!-- campaign: begin -->\n", "<!-- campaign: end -->\n"
 
 
-def fill(page: Path, records: list[Record]) -> None:
-    """Put the table between the marks of a page."""
-    text = page.read_text()
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    page.write_text(f"{before}{BEGIN}{markdown(records)}\n{END}{after}")
+def fill(page: Path, name: str, table: str) -> None:
+    """Put a table between the marks of a page."""
+    begin, end = (f"<!-- {name}: {where} -->\n" for where in ("begin", "end"))
+    before, rest = page.read_text().split(begin)
+    page.write_text(f"{before}{begin}{table}\n{end}{rest.split(end)[1]}")
 
 
 @cache
@@ -232,7 +230,7 @@ def main() -> None:
     if options.markdown:
         records = read(options.markdown)
         if options.fill:
-            fill(options.fill, records)
+            fill(options.fill, "campaign", markdown(records))
         print(markdown(records))
         return
     exact = [cell for cell in CELLS if cell.name == options.only]
