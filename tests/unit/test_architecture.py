@@ -60,10 +60,7 @@ def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
         yield from (alias.name for alias in node.names)
         return
     base = node.module or ""
-    if node.level:
-        is_package = SOURCES[module].name == "__init__.py"
-        parents = module.split(".")[: len(module.split(".")) - node.level + is_package]
-        base = ".".join([*parents, *([node.module] if node.module else [])])
+    assert not node.level, f"{module}: expected imports by whole names"
     submodules = [f"{base}.{alias.name}" for alias in node.names]
     found = [name for name in submodules if name in SOURCES]
     yield from found
