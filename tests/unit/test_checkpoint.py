@@ -2,7 +2,10 @@
 
 import json
 import os
+import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -144,6 +147,18 @@ def test_log_has_no_doubled_nor_broken_rows(tmp_path):
 
 
 # --- locks ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_run_in_use_is_refused_to_another_process(tmp_path):
+    """After one that was killed, whose lock is left behind: tests/system/test_reproduce.py."""
+    code = (
+        f"from pathlib import Path; from difflcs import _storage; _storage.locked(Path({str(tmp_path)!r})).__enter__()"
+    )
+    with RunDirectory(tmp_path).locked():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert f"InUseError: {tmp_path}" in done.stderr
+    assert re.search("in use; wait until .* another --out", done.stderr)
 
 
 def test_a_lock_moves_with_its_directory(tmp_path):
