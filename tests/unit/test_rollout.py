@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from difflcs import solve_lcp
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import append_episodes, collect, make_empty_record, mpc_actions, noisy_actions
+from difflcs.rl.rollout import append_episodes, collect, make_empty_record, mpc_actions, noisy_actions, transitions
 from tests.conftest import refuse
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
@@ -22,9 +22,10 @@ def test_collect_returns_what_happened():
     assert bool((rollouts["action"].abs() <= U_MAX).all())  # stored as executed, not as noised
     assert bool((rollouts["action"].abs() == U_MAX).any())
     params = pusher()
-    x, u = rollouts["state"][:, :-1], rollouts["action"]
+    x, u, x_next = transitions(rollouts)
+    assert torch.equal(x.view(3, STEPS, 2), rollouts["state"][:, :-1])
     lam = solve_lcp(params.F, params.gap(x, u)).lam
-    torch.testing.assert_close(params.next_state(x, u, lam), rollouts["state"][:, 1:])  # no reset between two steps
+    torch.testing.assert_close(params.next_state(x, u, lam), x_next)  # no reset between two steps
     torch.testing.assert_close(
         rollouts["errors", "position_error"], (rollouts["state"][:, -1, :1] - rollouts["goal"]).abs()[:, 0]
     )
