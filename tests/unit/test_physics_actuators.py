@@ -7,7 +7,7 @@ import torch
 
 from difflcs import LCSMPCLayer, QuadraticCost
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco import MujocoLCS, drive_mocap
+from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS, drive_mocap
 
 SLIDE = """<mujoco><option timestep=".002" integrator="{0}" gravity="0 0 0"/><worldbody><body>
     <joint name="a" type="slide" axis="1 0 0" damping="2" {2}/><geom size=".1" mass="1"/></body></worldbody>
@@ -114,15 +114,61 @@ def test_bounds_of_actions_are_those_that_limits_leave(kind, low, high):
     torch.testing.assert_close(bounds, wanted, rtol=0.05, atol=1e-6)
 
 
-@pytest.mark.parametrize(("drive", "harder"), [('kp="2000" kv="20" forcerange="-2 9"', True), ('kp="9"', False)])
+def load_heavy(drive, joint="", tendon=""):
+    """A slide that touches 20 kg."""
+    heavy = '<body pos=".2 0 0"><joint type="slide" axis="1 0 0"/><geom size=".1" mass="20"/></body></worldbody>'
+    xml = SLIDE.format("Euler", drive, joint).replace("</worldbody>", heavy + tendon)
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+TENDON = '<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed></tendon>'
+WEAK = {kind: LIMITED[kind] for kind in list(LIMITED)[:3]} | {
+    "tendon": ('<position tendon="t" gear="-.5" kp="20000" kv="400" forcerange="-8 8"/>', "", TENDON)
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*farther off")  # the servo on a tendon has no bounds, and is tried at ±1
 @pytest.mark.parametrize("motion", ["dynamic", "quasi-dynamic"])
-def test_a_servo_that_pushes_harder_than_it_can_is_warned_of_once(motion, drive, harder, recwarn):
-    weight = '<body pos=".21 0 0"><joint type="slide" axis="1 0 0"/><geom size=".1" mass="9"/></body></worldbody>'
-    xml = SLIDE.format("Euler", f'<position name="push" joint="a" {drive}/>', "").replace("</worldbody>", weight)
-    module = MujocoLCS(mujoco.MjModel.from_xml_string(xml), motion=motion, seconds=0.1)
-    for _ in range(2):
-        module.params(torch.zeros(module.n_x, dtype=torch.float64))
-    assert ["actuator push, " in str(w.message) and "at ±0.001" in str(w.message) for w in recwarn] == [True] * harder
+@pytest.mark.parametrize(("kind", "most"), [*zip(WEAK, (8e-4, 8e-4, 4e-4, -4e-4), strict=True)])
+def test_a_servo_pushes_no_harder_than_it_can(kind, most, motion):
+    """What it can do is as without a limit; told to do more, it moves the weight as far as in MuJoCo."""
+    model, strong = load_heavy(*WEAK[kind]), load_heavy(*WEAK[kind])
+    strong.actuator_forcelimited[:], strong.jnt_actfrclimited[:] = 0, 0
+    module, free = (MujocoLCS(one, motion=motion, seconds=0.1) for one in (model, strong))
+    data, x = mujoco.MjData(model), torch.zeros(2, module.n_x, dtype=torch.float64)
+    assert module.params(x).n_lam == module.n_lam == free.n_lam + 2
+    u = torch.full((2, 1), 0.9 * most, dtype=torch.float64)
+    torch.testing.assert_close(*(m.params(x).step(x, u).x_next for m in (module, free)), rtol=0, atol=1e-12)
+    for harder in (-40, 10, 40):
+        u = torch.full((2, 1), harder * most, dtype=torch.float64)
+        after = module.params(x).step(x, u).x_next[:, -1] / (1.0 if motion == "dynamic" else 0.1)
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = module.control(x, u)[0]
+        mujoco.mj_step(model, data, 50)
+        torch.testing.assert_close(after, torch.full_like(after, data.qvel[1]), rtol=0.1, atol=1e-9)
+
+
+def test_a_plan_and_what_is_learned_know_how_far_a_weak_servo_moves_what_is_heavy():
+    model = load_heavy(*WEAK["forcerange"])
+    module, data = LearnableMujocoLCS(model, learn=["gain"], motion="dynamic", seconds=0.1), mujoco.MjData(model)
+    wanted = torch.tensor([0.0, -50.0, 0.0, 0.0])
+    cost = QuadraticCost(torch.zeros(4, 4), torch.eye(1) * 1e-3, torch.diag(-20 * wanted), q_final=wanted).double()
+    plan = LCSMPCLayer(module, cost, 4, -0.05, 0.05)(torch.zeros(4, dtype=torch.float64))
+    for u in plan.u.detach():
+        data.ctrl[:] = module.control(module.physics.observe(data), u)
+        mujoco.mj_step(model, data, 50)
+    assert 0.01 < data.qpos[1] < plan.x[-1, 1] < 0.02  # 5 cm without limits of the force
+    plan.x.sum().backward()
+    assert module.change.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(("drive", "harder"), [
+    ('timeconst=".01" joint="a" kp="5000"', True), ('jointinparent="a" kp="5000"', True), ('joint="a" kp="9"', False),
+])  # fmt: skip
+def test_a_servo_that_pushes_harder_than_it_can_with_no_limit_in_the_system_is_warned_of(drive, harder, recwarn):
+    module = MujocoLCS(load_heavy(f'<position name="push" {drive} kv="1" forcerange="-4 4"/>'), motion="dynamic")
+    assert ["actuator push, " in str(w.message) for w in recwarn] == [True] * harder
+    assert module.n_lam == MujocoLCS(load_heavy(""), motion="dynamic", contacts=module.n_contacts).n_lam
 
 
 @pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_kind, check_tensor
-from difflcs.errors import ContactWarning, InvalidInputError, ShapeError, warn
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.mujoco.native import flags, to_numpy
 
 Array = NDArray[np.float64]
 
-_WEAK = 0.8  # part of its force that motion leaves of it, below which a servo pushes much harder than it can
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 _JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 _JOINTS = _JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -51,6 +50,10 @@ class Actuators:
             as the joint's limits leave.
         reach: (nu,) size of actions: half of the range, or 1.
         brakes: (nv,) damping by drives on slides and hinges whose force is limited.
+        gain, constant, bias, damping: (nu,) of the force: gain · control + constant + bias · length + damping · rate.
+        affine: (nu,) True if this is all, where activation has settled.
+        straight: (nu,) True if the length is linear in the positions of slides and hinges.
+        force: (2, nu) limits of the force; infinite where it has none.
         curved: (k,) those with a range whose force is not linear in the control, such as dampers and muscles.
     """
 
@@ -71,8 +74,8 @@ class Actuators:
         linear = fixed & affine
         self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
         self.holds = linear & (bias != 0) & ~self.drifts
-        self._gain, self._constant, self._bias, self._damping = np.where(gain != 0, gain, 1.0), constant, bias, damping
-        self.offset = np.where(self.servo, constant / self._gain, 0.0)
+        self.gain, self.constant, self.bias, self.damping = np.where(gain != 0, gain, 1.0), constant, bias, damping
+        self.offset = np.where(self.servo, constant / self.gain, 0.0)
         limited = np.array(model.actuator_ctrllimited, dtype=bool)
         limited &= not model.opt.disableflags & flags("CLAMPCTRL")
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
@@ -87,9 +90,15 @@ class Actuators:
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
         plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
-        self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
+        self.force = self._force_limits(model, joint)
+        self._force = np.where(plain, self.force, [[-np.inf], [np.inf]])
         brakes = np.where(np.isfinite(self._force).any(0) & (self.dof >= 0), -damping * self.gear**2, 0.0)
         self.brakes = np.bincount(self.dof.clip(0), brakes.clip(0), minlength=model.nv)
+        tendon = model.wrap_type[model.tendon_adr] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        of_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+        self.affine = linear & ~disabled_actuators(model)
+        self.straight = self.dof >= 0
+        self.straight[of_tendon] = tendon[joint[of_tendon]]
         self._exact = np.flatnonzero(dynamics == _EXACT)
         self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
         self._decays = dynamics[self.activated] == _EXACT
@@ -114,7 +123,7 @@ class Actuators:
 
     def balance(self, length: Array) -> Array:
         """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
-        return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
+        return np.where(self.holds, -(self.constant + self.bias * length) / self.gain, 0.0)
 
     def yields(self, moved: Array, velocity: Array | float) -> Array:
         """Part (nu,) of its force that an actuator keeps at the end of a step, as it moves.
@@ -123,23 +132,10 @@ class Actuators:
             moved: (nv, nv) how far a unit of force moves in a step in which actuators resist.
             velocity: (nv, nv) the velocity that it brings about.
         """
-        resists = np.maximum(-self._bias, 0.0)[:, None, None] * moved
-        resists += np.maximum(-self._damping, 0.0)[:, None, None] * velocity
+        resists = np.maximum(-self.bias, 0.0)[:, None, None] * moved
+        resists += np.maximum(-self.damping, 0.0)[:, None, None] * velocity
         lost = self.gear**2 * resists[np.arange(len(self.dof)), self.dof, self.dof]
         return np.where(self.dof >= 0, np.clip(1 - lost, 0.01, 1.0), 1.0)
-
-    def warn_of_weak(self, yields: Array, model: Any) -> None:
-        """Warn of servos that within their bounds push much harder against a contact than they can."""
-        least, gain = np.abs(self._force).min(0), np.abs(self._gain)
-        weak = (self.dof >= 0) & (yields < _WEAK) & (np.ptp(self.range, axis=0) * gain > least) & np.isfinite(least)
-        if weak.any():
-            i = int(np.where(weak, yields, np.inf).argmin())
-            warn(
-                f"expected servos that push no harder than they can, got actuator {model.actuator(i).name or i}, which "
-                f"may push up to {1 / yields[i]:.3g} times as hard against a contact: take fewer seconds, or keep the "
-                f"layer's bounds of its action at ±{least[i] / gain[i]:.3g}",
-                ContactWarning,
-            )
 
     def nominal(self, ctrl: Tensor, batch: torch.Size) -> Array:
         """Return nominal controls (*batch, nu) as an array.
@@ -170,8 +166,8 @@ class Actuators:
         """
         length, (low, high) = self._length(x), self.range
         if np.isfinite(self._force).any():
-            others = self._constant + self._bias * length + self._damping * self._length(velocity)
-            sides = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
+            others = self.constant + self.bias * length + self.damping * self._length(velocity)
+            sides = np.sort([(force / yields - others) / self.gain for force in self._force], axis=0)
             # Where the range leaves no such force, the control is at its end.
             low, high = np.clip(sides, *self.range[:, None])
         length = length * (self.servo & relative)
@@ -231,7 +227,7 @@ class Actuators:
     def describe_balance(self, relative: NDArray[np.intp]) -> dict[str, list[Any]]:
         """Describe `balance` and `clip` for the compiled part; actions of `relative` count from where they are."""
         low, high = self.range
-        numbers = {"gain": self._gain, "constant": self._constant, "bias": self._bias, "low": low, "high": high}
+        numbers = {"gain": self.gain, "constant": self.constant, "bias": self.bias, "low": low, "high": high}
         masks = {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
         return {name: values.tolist() for name, values in (numbers | masks).items()}
 

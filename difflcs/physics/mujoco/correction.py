@@ -92,7 +92,7 @@ class WholeStep:
 
 
 def correct(
-    system: LCSParams, step: DynamicStep, after: Array, tangent: Array | None, bound: Array, rows: Rows, hard: Any
+    system: LCSParams, step: DynamicStep, after: Array, tangent: Any, bound: Array, rows: Rows, hard: Any, servos: int
 ) -> tuple[LCSParams, NDArray[np.bool_]]:
     """Correct C and d of systems at n states; return them, and those (n,) where more is corrected than moves.
 
@@ -101,13 +101,16 @@ def correct(
         step: the motion without constraints.
         after: (n, 2 nv + na) after MuJoCo's step, see `WholeStep`; states with NaN stay as they are.
         tangent: of the states' rotations, see `MujocoState.tangent`.
-        bound: (n, n_bounded) of dry friction, the last forces of the systems.
+        bound: (n, n_bounded) of dry friction, the last forces of the systems but those of servos.
         rows: limits and dry friction.
         hard: (n, k) False for the forces of soft contacts, among the first k.
+        servos: how many have limits of their force, two multipliers each.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
     found = advance(system, *(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
     C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]).numpy() for v in (system.C, system.d, *found))
+    C, of_servos = np.split(C, [C.shape[2] - 2 * servos], 2)
+    lam = lam[:, : C.shape[2]]
     n_bounded, lower = bound.shape[1], np.zeros_like(lam)
     n_contacts = lam.shape[1] - 2 * n_bounded - (n_limits := rows.gap.shape[1] - n_bounded)
     lower[:, n_contacts + n_limits :][:, :n_bounded] = -bound
@@ -154,6 +157,7 @@ def correct(
     by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
     C[:, : 2 * nv] += by_forces
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
+    C = np.concatenate([C, of_servos], -1)
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
     return LCSParams.of_checked({**system.tensors(), "C": C, "d": d}), doubtful
 

@@ -13,14 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import (
-    check_array,
-    check_choice,
-    check_kind,
-    check_number,
-    check_tensor,
-    takes_arrays,
-)
+from difflcs._checks import check_array, check_choice, check_kind, check_number, check_tensor, takes_arrays
 from difflcs.physics.complementarity import (
     Bounded,
     Cone,
@@ -43,6 +36,7 @@ from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, ta
 from difflcs.physics.mujoco.nominal import Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
+from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
@@ -65,9 +59,10 @@ class MujocoLCS:
 
     Directions in which no joint can move are not in the Jacobians. Where all joints move in one plane, friction has
     one tangent, in this plane, and contacts across it, such as those of a floor below, are left out.
-    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state. Limits of
-    joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
-    without, is a bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
+    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state. A servo
+    that may push much harder than it can against a contact has limits of its force as well. Limits of joints and
+    tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does without, is a
+    bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
     Not in the system, with a `ContactWarning`: rolling friction, surfaces that move or stick. Refused: <adhesion>,
     delay, sleep, springs that yield, height fields and signed distance fields that may touch something, friction that
     differs by direction; in quasi-static motion disabled actuators. The matrices carry no gradient of the state. An
@@ -100,7 +95,7 @@ class MujocoLCS:
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
             geoms that move and may touch.
         limits: how many limits of joints and tendons a state has, those that the nominal action comes nearest to; None:
-            all, at most 8, with a `ContactWarning` where more act. 0 leaves them out.
+            all, at most 8, with a `ContactWarning` where more act. 0 leaves them out, and limits of forces of servos.
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
@@ -150,6 +145,7 @@ class MujocoLCS:
         stops = limits != 0 and not disabled & flags("CONSTRAINT", "LIMIT")
         self._actuators, self._relative = Actuators(model, stops), relative
         self._quasi_static = motion == "quasi-static"
+        self._servos = Servos(model, self._data, self._actuators, relative, self.seconds, motion == "dynamic")
         mobility = mobility if isinstance(mobility, str) else check_array("mobility", mobility)
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
@@ -173,7 +169,7 @@ class MujocoLCS:
         self._touching = copy.copy(model)
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
-            self._give, self._yields = _respond(self)
+            self._give, self._yields = _respond(self, limits != 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is built again, as what is compiled holds addresses."""
@@ -196,10 +192,10 @@ class MujocoLCS:
 
     @property
     def n_lam(self) -> int:
-        """Number of forces: of contacts, of those without friction last, of limits, two of each dry friction."""
+        """Number of forces: of contacts, those without friction last, of limits, two of each dry friction and servo."""
         rough, rows = int(self._finder.rough.sum()), self._rows
-        smooth = self.n_contacts - rough
-        return count_forces(rough, self._finder.n_tangents, self.cone, smooth + rows.n_limits, rows.n_friction)
+        more = self.n_contacts - rough + rows.n_limits, rows.n_friction + len(self._servos.those)
+        return count_forces(rough, self._finder.n_tangents, self.cone, *more)
 
     @in_turn
     def observe(self, data: Any) -> Tensor:
@@ -266,12 +262,13 @@ class MujocoLCS:
             **read.constraints(rows, effect),
         )
         system = LCSParams.of_fitting(matrices)
+        system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
             after = self._whole.simulate(self._places, read.states, idle)
             rubs, each = rows.bound * self._give / self.length, count_forces(1, self._finder.n_tangents, self.cone)
-            hard = np.repeat(~overlaps.soft[:, rough], each, 1)
-            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found, hard)
+            hard, servos = np.repeat(~overlaps.soft[:, rough], each, 1), len(self._servos.those)
+            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found, hard, servos)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
@@ -404,19 +401,21 @@ class _States(NamedTuple):
         return self.batched(rows)
 
 
-def _respond(of: MujocoLCS) -> tuple[float, Any]:
+def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
     moved = of._read_motion(here, of._ctrl[None])
     x = np.zeros((1, of.n_x))
     if not isinstance(of._motion, Dynamic):
-        response = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
-        yields = of._actuators.yields(response, 0.0)
+        response = far = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
+        velocity = 0.0
     else:
-        impulse = of._motion.finish(moved, x).response[0]
-        response = of.seconds * impulse
-        yields = of._actuators.yields(of.seconds * response, response)
+        response = velocity = of.seconds * of._motion.finish(moved, x).response[0]
+        far = of.seconds * response
+    if limits and of.n_contacts and not of._quasi_static:
+        of._servos.choose(far)
+    yields = of._actuators.yields(far, velocity)
     dimensions = 3 if finder.axis is None else 2
     return median_apart(model, data, here[0], response, finder.main_pairs, dimensions), yields
 
@@ -424,8 +423,6 @@ def _respond(of: MujocoLCS) -> tuple[float, Any]:
 def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
     first, of._tried = not of._tried, True
-    if first and of.n_contacts and not of._quasi_static:
-        of._actuators.warn_of_weak(of._yields, of._model)
     if step is None or of._whole is None:
         return
     if of._actuators.curved.size or first:

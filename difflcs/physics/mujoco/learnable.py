@@ -250,6 +250,7 @@ class LearnableMujocoLCS(nn.Module):
         built = MujocoLCS(self._changed(change), self._data, **{**self._options, "compliance": compliance})
         built.state = self.state
         built._tried = True  # with the first module
+        built._servos.those = kept[1]._servos.those
         if keep:
             self._built = key, built
         return built
