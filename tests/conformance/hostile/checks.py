@@ -1,8 +1,7 @@
 """Independent judges of what the library returns: nothing here calls difflcs.
 
 Every judge recomputes the conditions in float64 from the RETURNED numbers and gives, per condition and element,
-violation / limit: above 1 is a broken promise, and what is not a number counts as infinite. `SINGLE` is the allowance
-for results that were rounded to float32: one rounding of each term.
+violation / limit: above 1 is a broken promise, and what is not a number counts as infinite.
 """
 
 import numpy as np
@@ -17,7 +16,6 @@ from tests.conformance.judges import mul
 
 Ratios = dict[str, np.ndarray]
 
-SINGLE = 2.0**-22  # two roundings to float32: of a value and of what it is compared with
 _TINY = 1e-320
 
 
@@ -44,8 +42,8 @@ def _t(M: np.ndarray) -> np.ndarray:
 # ---- LCP ------------------------------------------------------------------------------------------------------------
 
 
-def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, single: bool) -> Ratios:
-    """Promises of `solve_lcp` for CONVERGED elements; problem and results in the caller's numbers, as float64.
+def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float) -> Ratios:
+    """Promises of `solve_lcp` for CONVERGED elements.
 
     - sign: λ, w ≥ 0.
     - equation: |w − (Fλ + q)|_i ≤ 1e-9 of the terms of row i, and ≤ 1e-7·max|q| (relaxed: + sqrt(relaxation·max F_ii)).
@@ -56,17 +54,13 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
         F, q = problem.F, problem.q
         terms = np.abs(q) + mul(np.abs(F), lam)
         error = np.abs(w - (mul(F, lam) + q))
-        rounding = np.zeros_like(terms)
-        if single:  # of w, of every λ; below 1e-38 float32 has fewer digits
-            rounding = SINGLE * (terms + np.abs(w)) + 2e-45 * (1 + np.abs(F).sum(-1))
         size = np.abs(q).max(-1, keepdims=True)
-        rounding = rounding + 1e-100 * size
+        rounding = 1e-100 * size
         product = np.abs(lam * w - relaxation)
         if relaxation > 0:
             diagonal = np.diagonal(F, axis1=-2, axis2=-1).max(-1)
             size = size + np.sqrt(relaxation * np.maximum(diagonal, 0.0)).reshape(-1, 1)
-            limit = (1e-9 + (SINGLE if single else 0)) * relaxation + (2e-45 * (lam + w) if single else 0)
-            complementary = _ratio(product, limit)
+            complementary = _ratio(product, 1e-9 * relaxation)
         else:
             complementary = np.where(((lam > 0) & (w > 0)).any(-1), np.inf, 0.0)
         return {
@@ -81,24 +75,7 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
 # ---- MPC ------------------------------------------------------------------------------------------------------------
 
 
-def bounds_in(problem: Case, dtype) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (count, 1, n_u) rounded inwards to the caller's dtype, as float64; their neighbours where that crosses."""
-    a = problem.full()
-    low, high = a["u_min"].astype(float), a["u_max"].astype(float)
-    if problem.numbers is not None:
-        low, high = np.full_like(low, problem.numbers[0]), np.full_like(high, problem.numbers[1])
-    if dtype == np.float64:
-        return low[:, None], high[:, None]
-    inner_low, inner_high = low.astype(dtype), high.astype(dtype)
-    inner_low = np.where(inner_low.astype(float) < low, np.nextafter(inner_low, dtype(np.inf)), inner_low)
-    inner_high = np.where(inner_high.astype(float) > high, np.nextafter(inner_high, dtype(-np.inf)), inner_high)
-    low, high = np.minimum(inner_low, inner_high), np.maximum(inner_low, inner_high)
-    return low.astype(float)[:, None], high.astype(float)[:, None]
-
-
-def judge_mpc(
-    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
-) -> Ratios:
+def judge_mpc(problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray) -> Ratios:
     """Promises of a solution whose status is CONVERGED or DEGENERATE.
 
     - start: x_0 is the caller's, exactly. bounds: u within them, exactly. sign: λ > 0.
@@ -106,40 +83,32 @@ def judge_mpc(
     - complementarity: |λ_i s_i − ε| ≤ 1e-6 ε + 1e-13 λ_i · terms of s_i, s = Dx + Eu + Fλ + c.
     - stationarity: a step of the whole width against the gradient, scaled by its terms, stays:
       |clip(u − width·g/G) − u| ≤ 1e-6 width. Free of units, and blind to no flat direction.
-    - objective: the cost of the returned trajectory, to 1e-9 (float32: 1e-5) of its terms.
+    - objective: the cost of the returned trajectory, to 1e-9 of its terms.
     - answer: the vertex of a linear program.
     """
     with np.errstate(all="ignore"):
-        a = {k: v.astype(float) for k, v in problem.full().items()}
-        single = dtype != np.float64
-        rounding = SINGLE if single else 0.0
-        low, high = bounds_in(problem, dtype)
+        a = problem.full()
+        low, high = a["u_min"][:, None], a["u_max"][:, None]
         now, after = x[:, :-1], x[:, 1:]
         predicted, next_terms = affine(a, "ABCd", now, u, lam)
         s, s_terms = affine(a, "DEFc", now, u, lam)
         cost, cost_terms = cost_of(problem, a, x, u, low, high)
         relaxation = problem.relaxation
-        stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high, rounding)
+        stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high)
         if (stationary > 1).any():
             # Where the terms of s are so large that their rounding is all of s, its other reading is ε/λ.
-            other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high, rounding)
+            other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high)
             stationary = np.minimum(stationary, other)
-        # Below 1e-38 float32 has fewer digits: x, u and λ are off by 1e-45 each, times what multiplies them.
-        tiny = 2e-45 * (1 + s_terms) if single else 0.0
-        least = 1e-44 * (1 + sum(np.abs(a[k]).sum(-1) for k in "ABC"))[:, None] if single else 0.0
         return {
             "finite": finite(x, u, lam, objective),
             "start": np.where((x[:, 0] == a["x0"]).all(-1), 0.0, np.inf),
             "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
             "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
-            "dynamics": _ratio(np.abs(after - predicted), 1e-6 * next_terms + least),
-            "complementarity": _ratio(
-                np.abs(lam * s - relaxation),
-                (1e-6 + rounding) * relaxation + (1e-13 + 2 * rounding) * lam * s_terms + tiny,
-            ),
+            "dynamics": _ratio(np.abs(after - predicted), 1e-6 * next_terms),
+            "complementarity": _ratio(np.abs(lam * s - relaxation), 1e-6 * relaxation + 1e-13 * lam * s_terms),
             "stationarity": stationary,
-            "objective": _ratio(np.abs(objective - cost), (1e-5 if single else 1e-9) * cost_terms),
-            "answer": _vertex(problem, u, low, high, rounding),
+            "objective": _ratio(np.abs(objective - cost), 1e-9 * cost_terms),
+            "answer": _vertex(problem, u, low, high),
         }
 
 
@@ -164,9 +133,9 @@ def cost_of(problem: Case, a: dict, x, u, low, high) -> tuple[np.ndarray, np.nda
     return total, terms
 
 
-def stationarity(problem: Case, a: dict, x, u, lam, s, s_terms, low, high, rounding: float) -> np.ndarray:
+def stationarity(problem: Case, a: dict, x, u, lam, s, s_terms, low, high) -> np.ndarray:
     """The projected step against the reduced gradient, in units of the width, over its limit."""
-    g, terms, noise = reduced_gradient(a, x, u, lam, s, s_terms, rounding)
+    g, terms = reduced_gradient(a, x, u, lam, s)
     width = np.broadcast_to(high - low, u.shape)
     last = np.concatenate([np.repeat(a["Q"][:, None], u.shape[1] - 1, 1), a["Q_final"][:, None]], 1)
     curvature = (a["B"][:, None] * (last @ a["B"][:, None])).sum(2)
@@ -181,23 +150,19 @@ def stationarity(problem: Case, a: dict, x, u, lam, s, s_terms, low, high, round
     G = np.where(G > 0, G, 1.0)
     divisor = np.where(width > 0, width, 1.0)
     # The action itself is rounded, by up to a part of its size; so is its distance in the terms of a barrier.
-    allowance = 1e-6 + noise / G + max(rounding, 2.0**-52) * np.abs(u) / divisor + (1e-14 + rounding) * spread / G
+    allowance = 1e-6 + 2.0**-52 * np.abs(u) / divisor + 1e-14 * spread / G
     move = np.clip(u - width * (g / G), low, high) - u
     return _ratio(np.where(width > 0, np.abs(move) / divisor, 0.0), allowance)
 
 
-def reduced_gradient(
-    a: dict, x, u, lam, s, s_terms, rounding: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The derivative dJ/du (count, H, n_u) by an own adjoint recursion, the sizes of its terms, and its rounding.
+def reduced_gradient(a: dict, x, u, lam, s) -> tuple[np.ndarray, np.ndarray]:
+    """The derivative dJ/du (count, H, n_u) by an own adjoint recursion, and the sizes of its terms.
 
     With ρ = λ∘y the equation (diag s + Fᵀ diag λ) y = −Cᵀp is (diag s/λ + Fᵀ) ρ = −Cᵀp; rows are scaled by λ/(λ+s).
-    The last is a first-order bound for x, u, λ rounded to float32: each by `rounding` of its size.
     """
     size = {k: np.abs(v) for k, v in a.items()}
     b = lam / (lam + s)
     p = mul(a["Q_final"], x[:, -1]) + a["q_final"]
-    p_noise = rounding * (mul(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
     steps = []
     for k in reversed(range(u.shape[1])):
         matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (s / (lam + s))[:, k, :, None]
@@ -205,19 +170,10 @@ def reduced_gradient(
         g = mul(a["R"], u[:, k]) + a["r"] + mul(_t(a["B"]), p) + mul(_t(a["E"]), rho)
         terms = mul(size["R"], np.abs(u[:, k])) + size["r"]
         terms = terms + mul(_t(size["B"]), np.abs(p)) + mul(_t(size["E"]), np.abs(rho))
-        noise, rho_noise = np.zeros_like(g), np.zeros_like(rho)
-        if rounding:
-            inverse = np.abs(_solve(matrix, np.broadcast_to(np.eye(rho.shape[-1]), matrix.shape)))
-            moved = mul(_t(size["C"]), p_noise + rounding * np.abs(p))
-            moved = moved + np.abs(rho) / lam[:, k] * rounding * (s_terms[:, k] + np.abs(s[:, k]))
-            rho_noise = mul(inverse, b[:, k] * moved) + rounding * np.abs(rho)
-            noise = mul(_t(size["B"]), p_noise) + mul(_t(size["E"]), rho_noise) + 2 * rounding * terms
-        steps.append((g, terms, noise))
-        p_noise = mul(_t(size["A"]), p_noise + rounding * np.abs(p)) + mul(_t(size["D"]), rho_noise)
-        p_noise = p_noise + rounding * (mul(size["Q"], np.abs(x[:, k])) + size["q"])
+        steps.append((g, terms))
         p = mul(a["Q"], x[:, k]) + a["q"] + mul(_t(a["A"]), p) + mul(_t(a["D"]), rho)
-    g, terms, noise = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
-    return g, terms, noise
+    g, terms = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
+    return g, terms
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -230,21 +186,21 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return out[..., 0] if vector else out
 
 
-def _vertex(problem: Case, u, low, high, rounding: float) -> np.ndarray:
+def _vertex(problem: Case, u, low, high) -> np.ndarray:
     if problem.answer is None or problem.barrier > 0:
         return np.zeros(len(u))
     known = np.isfinite(problem.answer)
     width = np.broadcast_to(high - low, u.shape)
     error = np.where(known, np.abs(u - np.where(known, problem.answer, u)), 0.0)
-    return _ratio(error, 1e-5 * width + rounding * np.abs(u))
+    return _ratio(error, 1e-5 * width)
 
 
 def judge_relaxed_program(
-    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
+    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray
 ) -> Ratios:
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):
-        ratios = judge_mpc(problem, x, u, lam, objective, dtype)
+        ratios = judge_mpc(problem, x, u, lam, objective)
         s, terms = affine(problem.full(), "DEFc", x[:, :-1], u, lam)
         kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
         return {

@@ -86,8 +86,14 @@ def refused_one_by_one(run: Callable[..., Outcome], problem) -> Outcome:
         return Outcome.join([refused_one_by_one(run, part) for part in parts])
 
 
-def _double(value: torch.Tensor) -> np.ndarray:
-    return value.detach().double().numpy()
+def _numpy(value: torch.Tensor) -> np.ndarray:
+    return value.detach().numpy()
+
+
+def _rounding(*pairs: tuple[torch.Tensor, torch.Tensor]) -> np.ndarray:
+    """float32 is solved in float64: 0 where the one is the other, rounded, else ∞."""
+    same = [(one == other.to(one.dtype)).reshape(len(one), -1).all(1).numpy() for one, other in pairs]
+    return np.where(np.all(same, axis=0), 0.0, np.inf)
 
 
 def _promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
@@ -120,9 +126,12 @@ def _lcp(problem: LCP, relaxation: float, dtype) -> Outcome:
     with quiet():
         solution = solve_lcp(F, q, relaxation)
     (solution.lam.sum() + solution.w.sum()).backward()
-    double = LCP(problem.F.astype(float), problem.q.astype(float))
-    lam, w, status = _double(solution.lam), _double(solution.w), solution.status.numpy().astype(int)
-    ratios = checks.judge_lcp(double, lam, w, relaxation, single=dtype != np.float64)
+    status, wide = solution.status.numpy().astype(int), problem.cast(np.float64)
+    with quiet():
+        judged = solve_lcp(torch.from_numpy(wide.F), torch.from_numpy(wide.q), relaxation)
+    ratios = checks.judge_lcp(wide, _numpy(judged.lam), _numpy(judged.w), relaxation)
+    ratios["finite"] = checks.finite(_numpy(solution.lam), _numpy(solution.w))
+    ratios["rounding"] = _rounding((solution.lam, judged.lam), (solution.w, judged.w))
     F_grad, q_grad = F.grad, q.grad
     assert F_grad is not None
     assert q_grad is not None
@@ -228,10 +237,21 @@ def _mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
         layer = layer_of(problem, leaves, backend)
         plan = layer(leaves["x0"], guess=guess(problem, layer, leaves["x0"]))
         (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.mean((-1, -2)) + plan.objective).sum().backward()
-    x, u, lam, objective = (_double(v) for v in (plan.x, plan.u, plan.lam, plan.objective))
-    status = plan.status.numpy().astype(int)
-    ratios = judge(problem, x, u, lam, objective, dtype)
-    ratios["finite"] = np.maximum(ratios["finite"], checks.finite(plan.kkt_residual.numpy()))
+        judged, wide = plan, problem.cast(np.float64)
+        if dtype != np.float64:
+            doubles = leaves_of(wide)
+            judged = layer_of(wide, doubles, backend)(doubles["x0"])
+    names, status = ("x", "u", "lam", "objective"), plan.status.numpy().astype(int)
+    ratios = judge(wide, *(_numpy(getattr(judged, k)) for k in names))
+    ratios["finite"] = checks.finite(*(_numpy(getattr(plan, k)) for k in (*names, "kkt_residual")))
+    # Bounds are rounded inwards, or to their neighbours where that crosses.
+    low, high = (wide.full()[k][:, None] for k in ("u_min", "u_max"))
+    inner_low, inner_high = low.astype(dtype), high.astype(dtype)
+    inner_low = np.where(inner_low < low, np.nextafter(inner_low, dtype(np.inf)), inner_low)
+    inner_high = np.where(inner_high > high, np.nextafter(inner_high, dtype(-np.inf)), inner_high)
+    u = _numpy(judged.u).astype(dtype).clip(np.minimum(inner_low, inner_high), np.maximum(inner_low, inner_high))
+    rounded = [torch.from_numpy(u) if k == "u" else getattr(judged, k) for k in names]
+    ratios["rounding"] = _rounding(*zip([getattr(plan, k) for k in names], rounded, strict=True))
     gradient = np.zeros(problem.count)
     shared_bad = False
     for name, leaf in leaves.items():
@@ -316,6 +336,8 @@ def _castable(problem: Case, dtype) -> Case:
     finite = {k: np.nan_to_num(v) for k, v in small.arrays.items()}
     # Rounding must not make bounds cross.
     finite["u_max"] = np.maximum(finite["u_max"], finite["u_min"])
+    if problem.numbers:  # which have no dtype
+        finite |= {k: problem.arrays[k] for k in ("u_min", "u_max")}
     return replace(small, arrays=finite)
 
 
@@ -374,7 +396,7 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
         )
         guess = Primal(*(v.detach() for v in values))
         solved = (plan.status == Status.CONVERGED).numpy()
-        found = (_double(v) for v in (*values, plan.objective))
+        found = (_numpy(v) for v in (*values, plan.objective))
         solved &= checks.judge_mpc(problem, *found)["stationarity"] <= 1e-2  # else it is not the point of its gradient
 
         def solve(step: float):
@@ -394,13 +416,13 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
                 change += product.reshape(count, -1).sum(-1)
             same = solved & (high.converged & low.converged).numpy()
             # Both must stay on the branch of the solution, and solve their own problems to far less than a step.
-            base, up, down = (_double(v.u) for v in (plan, high, low))
+            base, up, down = (_numpy(v.u) for v in (plan, high, low))
             width = np.maximum(np.abs(a["u_max"] - a["u_min"])[:, None], 1e-300)
             scale = np.minimum(width, np.abs(base).max((1, 2), keepdims=True))  # a range of 1e8 hides another optimum
             jump = np.abs(0.5 * (up + down) - base) > 1e-6 * scale + np.abs(up - down)
             same &= ~jump.any((1, 2))
             for sign, found in ((1, high), (-1, low)):
-                numbers = (_double(v) for v in (found.x, found.u, found.lam, found.objective))
+                numbers = (_numpy(v) for v in (found.x, found.u, found.lam, found.objective))
                 ratios = checks.judge_mpc(moved(sign * step), *numbers)
                 same &= (np.stack(list(ratios.values())).max(0) <= 1) & (ratios["stationarity"] <= 1e-3)
             return (change / (2 * step)).numpy(), same
