@@ -295,6 +295,8 @@ FORMS = {
     "half_open": lambda build: make(build, seed=5, bound=0.05).changed(u_max=torch.tensor([INF, 0.05]).double()),
     "unbounded": unbounded,
     "no_contact": lambda build: make(build, seed=7, n_lam=0, bound=0.1),
-    "no_contact_stages": lambda build: make(build, seed=8, n_lam=0, bound=0.1, staged=(*LCS, "Q", "R", "q", "r")),
+    "no_contact_stages": lambda build: make(
+        build, seed=8, n_lam=0, bound=0.1, staged=(*LCS, "Q", "R", "q", "r")
+    ).changed(S=0.1 * build.normal(3)(4, 2)),
 }
 PROBLEMS = PLAIN | FORMS | CONSTRAINED

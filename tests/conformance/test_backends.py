@@ -18,7 +18,7 @@ from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
 from tests.conformance import judges, problems
 from tests.conformance.differences import compare, moves, weigh
-from tests.conformance.problems import BOUNDS, COST, HORIZON, INF, LCS, PROBLEMS, STAGED, make, solve
+from tests.conformance.problems import BOUNDS, COST, INF, LCS, PROBLEMS, STAGED, make, solve
 
 BACKENDS = available_backends()
 EXACT = tuple(name for name in BACKENDS if get_backend(name).exact)
@@ -144,29 +144,6 @@ def test_exact_backends_agree_where_they_find_the_same_optimum(solutions, name):
         width = float(torch.as_tensor(t["u_max"] - t["u_min"]).clamp_max(1.0).max())
         assert float((first.u - second.u).abs()[same].max()) <= 1e-2 * width
         assert float((first.mu - second.mu).abs()[same].sum()) <= 1e-3 * (1 + float(first.mu.sum()))
-
-
-@pytest.mark.parametrize("name", ["no_contact", "no_contact_stages"])
-@every_exact
-def test_without_contact_and_bounds_the_plan_is_riccatis(build, name, backend):
-    problem = PROBLEMS[name](build).without(BOUNDS).changed(S=0.1 * build.normal(3)(4, 2))
-    sol, t = solve(problem, backend), problem.full()
-    assert sol.lam.shape == (4, HORIZON, 0)
-    at = {k: (lambda j, k=k: t[k][:, j if k in problem.staged else 0]) for k in "ABdQRSqr"}
-    P, p, gains = t["Q_final"][:, 0], t["q_final"][:, 0], []
-    for k in reversed(range(HORIZON)):
-        A, B, d, Q, R, S, q, r = (at[key](k) for key in "ABdQRSqr")
-        H, M, h = R + B.mT @ P @ B, S + A.mT @ P @ B, r + judges.mul(B.mT, p + judges.mul(P, d))
-        K, f = -torch.linalg.solve(H, M.mT), -torch.linalg.solve(H, h)
-        p = q + judges.mul(A.mT, p + judges.mul(P, d)) + judges.mul(M, f)
-        P = Q + A.mT @ P @ A + M @ K
-        gains.insert(0, (K, f))
-    x = t["x0"]
-    for k, (K, f) in enumerate(gains):
-        u = judges.mul(K, x) + f
-        torch.testing.assert_close(sol.u[:, k], u, rtol=1e-7, atol=1e-9)
-        x = judges.mul(at["A"](k), x) + judges.mul(at["B"](k), u) + at["d"](k)
-    torch.testing.assert_close(sol.x[:, -1], x, rtol=1e-7, atol=1e-9)
 
 
 @every_exact

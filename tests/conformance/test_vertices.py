@@ -8,14 +8,10 @@ from scipy.optimize import linprog
 from difflcs import ConstraintSequence, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
 from difflcs.errors import SolveWarning
 from difflcs.mpc import Primal, kkt
-from difflcs.mpc.problem import MPCProblem
+from tests.conftest import tensor
 
 INF = float("inf")
 EXACT = pytest.mark.parametrize("backend", ["batched", "ipopt"])
-
-
-def tensor(value) -> torch.Tensor:
-    return torch.as_tensor(np.array(value), dtype=torch.float64)
 
 
 def system(A, B, **contact) -> LCSParams:
@@ -123,22 +119,16 @@ def test_the_gradient_at_a_vertex_is_that_of_the_limit_that_holds_it(backend):
     assert float(torch.autograd.grad(plan.u.sum() + 0.5 * plan.objective, g)[0]) == pytest.approx(0.5, abs=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
 @pytest.mark.parametrize("growth", [0.5, 0.99, 1.5])
 def test_the_least_scale_does_not_grow_with_the_horizon(growth):
     """Terms that cancel at every one of 60 stages: a gradient of a millionth of the costs is still seen."""
-    n, H = 2, 60
     rotation = growth * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
-    zero = {
-        k: torch.zeros(s).double() for k, s in {"Q": (n, n), "R": (n, n), "Q_final": (n, n), "d": n, "q": n}.items()
-    }
-    contact = {"C": torch.zeros(n, 0), "D": torch.zeros(0, n), "E": torch.zeros(0, n), "F": torch.zeros(0, 0)}
-    problem = MPCProblem(
-        A=tensor(rotation), B=torch.eye(n).double(), **zero, **{k: v.double() for k, v in contact.items()},
-        c=torch.zeros(0).double(), r=torch.zeros(n).double(), q_final=tensor([1e-6, 0]), u_min=-torch.ones(n).double(),
-        u_max=torch.ones(n).double(), G_x=tensor([[1, 0], [-1, 0]]), G_u=torch.zeros(2, n).double(),
-        g=torch.zeros(2).double(), price=tensor([2, 2]), x0=torch.zeros(1, n).double(), horizon=H, relaxation=1e-5,
-    )  # fmt: skip
-    u, mu = torch.zeros(1, H, n).double(), torch.ones(1, H + 1, 2).double()
+    rows = LinearConstraints(G=tensor([[1, 0], [-1, 0]]), g=tensor([0, 0]), weight=tensor([2, 2]))
+    lcs, weights = system(rotation, np.eye(2)), cost(2, 2, q_final=[1e-6, 0])
+    layer = LCSMPCLayer(lcs, weights, 60, -1.0, 1.0, constraints=rows, on_failure="mask")
+    problem = layer(torch.zeros(1, 2).double()).problem
+    u, mu = torch.zeros(1, 60, 2).double(), torch.ones(1, 61, 2).double()
     x, lam = problem.rollout(u)
     primal = Primal(x, u, lam, mu)
     assert float(kkt.residual(problem, primal, kkt.multipliers(problem, primal))) > kkt.CERTIFIED

@@ -21,11 +21,6 @@ from difflcs.physics import PlanarPushing, box
 from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco
 from tests.conftest import refuse
 
-SHAPES = {
-    "sphere": 'type="sphere" size=".03"',
-    "capsule": 'type="capsule" size=".02 .04"',
-    "box": 'type="box" size=".05 .03 .02"',
-}
 PLANE = '<joint name="{0}x" type="slide" axis="1 0 0"/><joint name="{0}y" type="slide" axis="0 1 0"/>'
 PUSHER = f"""
 <body name="pusher">{PLANE.format("p")}<geom name="tip" type="sphere" size=".015" mass=".2" {{tip}}/></body>"""
@@ -214,7 +209,9 @@ def test_parents_touch_only_where_named():
 
 
 CUBE = " ".join(f"{x} {y} {z}" for x, y, z in itertools.product((-0.05, 0.05), repeat=3))
-FACES = SHAPES | {
+FACES = {
+    "sphere": 'type="sphere" size=".03"',
+    "capsule": 'type="capsule" size=".02 .04"',
     "ellipsoid": 'type="ellipsoid" size=".05 .04 .03"',
     "cylinder": 'type="cylinder" size=".05 .05"',
     "box": 'type="box" size=".05 .05 .05"',
