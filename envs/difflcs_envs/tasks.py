@@ -16,8 +16,7 @@ from difflcs.cost import GoalCost
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, register_task
 from difflcs.systems import pushing_cost
 from difflcs_envs.hand import task as hand
-from difflcs_envs.trifinger.arguments import checked_task
-from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask, checked_task
 from difflcs_envs.ycb import YCB
 
 STATE_SIZE = 9  # object x, y [m], yaw [rad], then x, y [m] of three fingertips

@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from difflcs_envs.checks import checked_array, checked_options
+from difflcs_envs.checks import checked_array, checked_integer, checked_options
 from difflcs_envs.errors import PhysicsWarning
 from difflcs_envs.trifinger.base import UNSTABLE, TriFingerEnv
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
@@ -63,15 +63,11 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
             autoreset_mode: See the class.
             threads: Most threads that step them; None: one per CPU core.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ValueError(f"Expected num_envs to be a whole number >= 1, got {num_envs!r}. Choose such a number.")
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise ValueError(f"Expected threads to be a whole number >= 1 or None, got {threads!r}. Choose one.")
-        self.num_envs = int(num_envs)
+        self.num_envs = checked_integer("num_envs", num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # pyright: ignore[reportAttributeAccessIssue]
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.threads = cores if threads is None else threads
+        self.threads = cores if threads is None else checked_integer("threads", threads)
         self.envs = [env, *(env.sibling() for _ in range(self.num_envs - 1))]
         self.render_mode = env.render_mode
         self.single_observation_space = env.observation_space

@@ -11,8 +11,7 @@ import numpy as np
 from difflcs_envs.checks import checked_array, checked_integer, checked_number
 from difflcs_envs.errors import MissingDependencyError, RenderingError
 from difflcs_envs.rendering import SceneViewer, has_display, select_gl_backend
-from difflcs_envs.trifinger.arguments import checked_task
-from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask, checked_task
 
 select_gl_backend()  # before the first import of MuJoCo
 try:

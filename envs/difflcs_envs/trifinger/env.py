@@ -32,36 +32,24 @@ class TriFingerMoveCubeEnv(TriFingerEnv):
     `Box(-0.015, 0.015, (6,), float64)`: the displacement of each fingertip from where it is now. Actions outside the
     box are clipped to it; `info["executed_action"]` is what was executed, `info["clipped"]` says whether it differs.
 
-    | Num | Action                         | Min    | Max   | Unit |
-    |-----|--------------------------------|--------|-------|------|
-    | 0   | displacement of fingertip 0, x | -0.015 | 0.015 | m    |
-    | 1   | displacement of fingertip 0, y | -0.015 | 0.015 | m    |
-    | 2   | displacement of fingertip 1, x | -0.015 | 0.015 | m    |
-    | 3   | displacement of fingertip 1, y | -0.015 | 0.015 | m    |
-    | 4   | displacement of fingertip 2, x | -0.015 | 0.015 | m    |
-    | 5   | displacement of fingertip 2, y | -0.015 | 0.015 | m    |
+    | Num    | Action                                               | Min    | Max   | Unit |
+    |--------|------------------------------------------------------|--------|-------|------|
+    | 0 to 5 | displacements of fingertips 0, 1, 2, x and y of each | -0.015 | 0.015 | m    |
 
     ## Observation space
 
     `Dict(goal=Box(3), state=Box(9))`, all float64, in the frame of the table (z up, origin below the hand).
 
-    | Num | `state`           | Min    | Max   | Unit |
-    |-----|-------------------|--------|-------|------|
-    | 0   | cube x            | -0.5   | 0.5   | m    |
-    | 1   | cube y            | -0.5   | 0.5   | m    |
-    | 2   | cube yaw          | -8 pi  | 8 pi  | rad  |
-    | 3   | fingertip 0, x    | -0.5   | 0.5   | m    |
-    | 4   | fingertip 0, y    | -0.5   | 0.5   | m    |
-    | 5   | fingertip 1, x    | -0.5   | 0.5   | m    |
-    | 6   | fingertip 1, y    | -0.5   | 0.5   | m    |
-    | 7   | fingertip 2, x    | -0.5   | 0.5   | m    |
-    | 8   | fingertip 2, y    | -0.5   | 0.5   | m    |
+    | Num    | `state`                              | Min    | Max   | Unit |
+    |--------|--------------------------------------|--------|-------|------|
+    | 0, 1   | cube x, y                            | -0.5   | 0.5   | m    |
+    | 2      | cube yaw                             | -8 pi  | 8 pi  | rad  |
+    | 3 to 8 | fingertips 0, 1, 2, x and y of each  | -0.5   | 0.5   | m    |
 
-    | Num | `goal`            | Min    | Max   | Unit |
-    |-----|-------------------|--------|-------|------|
-    | 0   | cube x            | -0.06  | 0.06  | m    |
-    | 1   | cube y            | -0.06  | 0.06  | m    |
-    | 2   | cube yaw          | -0.5   | 0.5   | rad  |
+    | Num    | `goal`                               | Min    | Max   | Unit |
+    |--------|--------------------------------------|--------|-------|------|
+    | 0, 1   | cube x, y                            | -0.06  | 0.06  | m    |
+    | 2      | cube yaw                             | -0.5   | 0.5   | rad  |
 
     The yaw is continuous within an episode: it starts in [-pi, pi] and each step adds the turn made, so that no jump
     by 2 pi disturbs a learned model or the cost. Beyond the bounds, which no push reaches, it is wrapped.

@@ -4,16 +4,19 @@ All functions take states (..., 9), actions (..., 6) and goals (..., 3) with any
 state or a step takes NumPy arrays or PyTorch tensors and returns the like; with tensors, rewards can be differentiated.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from difflcs_envs.checks import checked_number
 from difflcs_envs.goal_task import Array, GoalTask, library_of
 
 ACTION_SIZE = 6  # x, y of three tips
 ACTION_LIMIT = 0.015  # [m] per component and step
 GOAL_SIZE = 3  # x, y, yaw
 EPISODE_STEPS = 20
+REWARD_TERMS = ("tips", "position", "yaw", "action")
 
 
 @dataclass(frozen=True)
@@ -104,3 +107,28 @@ MOVE = MoveTask()
 """Push a cube or another object."""
 TURN = MoveTask(position_tolerance=0.001, goal_high=(0.0, 0.0, 1.5))
 """Turn a cube on its pivot: the position is practically fixed, and the goal is a yaw."""
+
+
+def checked_task(
+    task: MoveTask, yaw_tolerance: float, sparse_penalty: float, reward_weights: Mapping[str, float] | None
+) -> MoveTask:
+    """Return a task with other numbers, after checking each of them.
+
+    Raises:
+        ValueError: A number is out of range, or a reward weight has an unknown name.
+    """
+    weights = dict(reward_weights or {})
+    if unknown := sorted(set(weights) - set(REWARD_TERMS), key=str):
+        raise ValueError(
+            f"Expected reward_weights for {', '.join(REWARD_TERMS)}, got also {unknown}. Choose among these terms."
+        )
+    return replace(
+        task,
+        position_tolerance=checked_number("position_tolerance", task.position_tolerance, low=0.0),
+        yaw_tolerance=checked_number("yaw_tolerance", yaw_tolerance, low=0.0),
+        sparse_penalty=checked_number("sparse_penalty", sparse_penalty, low=0.0),
+        **{
+            f"{name}_weight": checked_number(f"reward_weights['{name}']", value, low=0.0)
+            for name, value in weights.items()
+        },
+    )
