@@ -7,6 +7,7 @@ not promise: that its plan solves the problem as stated, in every form.
 import dataclasses
 import functools
 import math
+import pickle
 import warnings
 
 import pytest
@@ -380,6 +381,7 @@ def test_a_backend_is_a_frozen_dataclass_whose_string_is_its_default_instance(ba
     instance = get_backend(backend)
     assert dataclasses.is_dataclass(instance)
     assert instance == type(instance)()
+    assert vars(pickle.loads(pickle.dumps(instance))) == vars(instance)
     assert instance.name == backend
     assert type(instance).__doc__
     with pytest.raises(dataclasses.FrozenInstanceError):

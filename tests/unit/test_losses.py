@@ -39,10 +39,6 @@ def sigma(F):
     return torch.linalg.eigvalsh((F + F.mT).detach())[..., 0]
 
 
-def learnable(params):
-    return LCSParams(**{k: v.detach().clone().requires_grad_() for k, v in params.tensors().items()})
-
-
 def least(params, data, gamma, xi):
     """The losses of one system by the campaign's own solution of their inner problems."""
     system, (x, u, x_next) = {k: v.numpy() for k, v in params.tensors().items()}, (v.numpy() for v in data)
@@ -136,7 +132,7 @@ def test_batch_dimensions_of_systems_and_data_broadcast(build, function):
 
 @pytest.mark.parametrize("function", [violation_loss, prediction_loss])
 def test_an_empty_batch_of_systems_has_no_loss(build, function):
-    params = learnable(build.params(batch=(0,)))
+    params = LCSParams(**{k: v.requires_grad_() for k, v in build.lcs_tensors(batch=(0,)).items()})
     x, u = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64)
     model = build.model(seed=3)
     for lcs in (params, model):

@@ -1,7 +1,5 @@
 """Backend `relaxed`: its convex program, gradient and failures; more of all three in test_backends.py."""
 
-import pickle
-
 import pytest
 import torch
 
@@ -213,8 +211,3 @@ def test_what_the_program_does_not_have_is_refused(build, calls, change, match):
     t = tensors(build)
     problem = MPCProblem(**{**t, **change(t)}, horizon=3, relaxation=1e-4)
     refuse(InvalidInputError, match + r".*; use backend='batched' or 'ipopt'", RelaxedBackend().solve, problem, None)
-
-
-def test_it_can_be_pickled():
-    backend = RelaxedBackend(penalties=(2.0,), threads=1)
-    assert pickle.loads(pickle.dumps(backend)) == backend

@@ -18,7 +18,6 @@ import zlib
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -168,25 +167,16 @@ def read(path: Path) -> list[Record]:
     return records
 
 
-def table(records: list[Record]) -> dict[str, Record]:
-    """One record per cell, in the order of the cells."""
-    rows: dict[str, Record] = {}
-    for record in records:
-        rows.setdefault(record.cell, Record(record.cell, record.seed)).add(record)
-    order = {cell.name: i for i, cell in enumerate(CELLS)}
-    return dict(sorted(rows.items(), key=lambda item: order.get(item[0], len(order))))
-
-
 def markdown(records: list[Record]) -> str:
     """The table of docs/promises.md: one row per class, all targets together."""
-    rows: dict[str, Record] = {}
+    rows = {cell.problems: Record(cell.problems, 0) for cell in CELLS}
     total = Record("all", 0)
-    for name, record in table(records).items():
-        problems = name.split("/")[0]
-        rows.setdefault(problems, Record(problems, record.seed)).add(record)
+    for record in records:
+        problems = record.cell.split("/")[0]
+        rows.setdefault(problems, Record(problems, 0)).add(record)
         total.add(record)
     lines = ["| problems | tried | solved [%] | flagged | gradients compared | silent |", "|---|---|---|---|---|---|"]
-    for row in (*rows.values(), total):
+    for row in (*(row for row in rows.values() if row.tried), total):
         solved = f"{100 * row.solved_share:.1f}"
         lines.append(f"| {row.cell} | {row.tried} | {solved} | {row.flagged} | {row.compared} | {row.silent} |")
     return "\n".join(lines)
@@ -202,13 +192,7 @@ def fill(page: Path, name: str, table: str) -> None:
     page.write_text(f"{before}{begin}{table}\n{end}{rest.split(end)[1]}")
 
 
-@cache
-def _one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 def _work(cell: Cell, seed: int, number: int) -> Record:
-    _one_thread()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of NumPy and cvxpylayers, about the overflows that are asked for
         return run_chunk(cell, seed, number)
@@ -249,7 +233,8 @@ def main() -> None:
         file.write("\n")  # a kill cut the last line
     started, last = time.perf_counter(), 0.0
     # Processes of their own, one thread each: a crash of a solver ends the run with an error, never in silence.
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+    alone = {"mp_context": get_context("spawn"), "initializer": torch.set_num_threads, "initargs": (1,)}
+    with ProcessPoolExecutor(options.workers, **alone) as pool:
         futures = [pool.submit(_work, cell, options.seed, number) for cell, number in todo]
         for k, future in enumerate(as_completed(futures)):
             record = future.result()

@@ -13,7 +13,7 @@ from tests.conformance.cases import Case
 INF = np.inf
 
 
-def random_case(seed: int, batch: int = 8, n_lam: int | None = None, bounds: bool = True, rows: bool = True) -> Case:
+def random_case(seed: int, batch: int = 8, n_lam: int | None = None, rows: bool = True) -> Case:
     """A batch whose sizes, forms and numbers follow from the seed: n_x 2 to 12, n_lam 0 to 12, H 1 to 40."""
     rng = np.random.default_rng([seed, 18])
     n_x, n_u = int(rng.integers(2, 13)), int(rng.integers(1, 5))
@@ -44,8 +44,8 @@ def random_case(seed: int, batch: int = 8, n_lam: int | None = None, bounds: boo
     cross = 0.05 * normal((n_x, n_u)) / n_x**0.5 if rng.random() < 0.5 else np.zeros((n_x, n_u))
     arrays["S"] = form.scale("S", cross)
     low, high = -rng.uniform(0.2, 1.5, n_u), rng.uniform(0.2, 1.5, n_u)
-    low[rng.random(n_u) < (0.3 if bounds else 2)] = -INF
-    high[rng.random(n_u) < (0.3 if bounds else 2)] = INF
+    low[rng.random(n_u) < 0.3] = -INF
+    high[rng.random(n_u) < 0.3] = INF
     arrays |= {"u_min": form.scale("u_min", low), "u_max": form.scale("u_max", high)}
     arrays["x0"] = normal((batch, n_x))
     case = Case(arrays, horizon, float(rng.choice([1e-3, 1e-4, 1e-5])))
@@ -109,5 +109,4 @@ def _constrained(case: Case, rng: Generator, form: _Form) -> Case:
         # At most half of the actions are spoken for at each stage, or nothing would be left to choose.
         g[rng.random(g.shape) < max(0.5, 1 - 0.5 * n_u / n_c)] = INF
     g[:, 0] = np.maximum(g[:, 0], c[:, 0]) if known else INF
-    case = replace(case, arrays={**arrays, "g": g}, witness=u.numpy() if known else None)
-    return case
+    return replace(case, arrays={**arrays, "g": g}, witness=u.numpy() if known else None)
