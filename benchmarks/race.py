@@ -92,19 +92,13 @@ class Options:
     problems: int = 5
     """Problems of an entry that are solved one by one."""
     batch: int = 256
-    """Problems of an entry with contact that are solved in one call, by who can."""
-    linear_batch: int = 32
-    """The same without contact."""
-    small_problems: int = 4
-    """Problems of an entry of the comparison with global optima."""
+    """Problems of an entry with contact that are solved in one call, by who can; without contact at most 32."""
     seeds: int = 3
     """Models, or seeds of initial states, of a family."""
     rounds: int = 2
     """How often everybody solves everything, taking turns; the shortest time of each problem counts."""
     seconds: float = 1.0
     """CPU seconds of a rival for an entry and round; after at least two problems it stops there."""
-    nodes: int = 20_000
-    """Quadratic programs of a branch and bound before it gives up."""
     venvs: Path = Path("/tmp/difflcs-race")
     """Folder of the rivals' environments."""
     install: bool = False
@@ -385,7 +379,7 @@ def best_rival(families: dict[str, dict]) -> dict[str, dict]:
 def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     """Run one part of the race; return its entries of the JSON."""
     entries = tuple(e for e in (CONTACT if name == "contact" else LINEAR) if not o.only or e.label in o.only)
-    batch, make = (o.batch, with_contact) if name == "contact" else (o.linear_batch, without_contact)
+    batch, make = (o.batch, with_contact) if name == "contact" else (min(o.batch, 32), without_contact)
     problems = make(max(batch, o.problems), o.seeds)
     with tempfile.TemporaryDirectory() as folder:
         processes = start(entries, o.venvs, folder)
@@ -406,7 +400,7 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
 
 def globally(o: Options) -> dict[str, dict]:
     """Compare our plans on small problems with global optima with hard contact."""
-    branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
+    branch = Entry("branch and bound", "global_optimum", {"nodes": 300} if o.smoke else {}, "rivals", ("daqp",))
     backends = {
         "`batched`": (BatchedBackend(), RELAXATION),
         "`batched`, λ·s = 1e-7": (BatchedBackend(), 1e-7),
@@ -430,7 +424,7 @@ def globally(o: Options) -> dict[str, dict]:
             problem.save(path)
             return process.ask(problem=path, out=f"{folder}/answer.npz", few=problem.count, seconds=1e9)
 
-        outcome = global_gaps(small(o.small_problems, o.seeds), optimum, ours)
+        outcome = global_gaps(small(min(o.problems, 4), o.seeds), optimum, ours)
         process.close()
     return outcome
 
@@ -444,11 +438,10 @@ def main(o: Options) -> None:
         tune(o.tune, o.only)
         return
     if o.smoke:
-        o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
+        o.problems, o.batch, o.seeds, o.rounds = 2, 3, 1, 1
         o.out = o.out.with_stem(f"{o.out.stem}-smoke")
     torch.set_num_threads(1)
-    names = ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
-    options = {name: getattr(o, name) for name in names}
+    options = {name: getattr(o, name) for name in ("problems", "batch", "seeds", "rounds")}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
         alone = {"global": globally, "planners": lambda o: measure(o.problems, o.seeds, o.rounds, o.only)}

@@ -1,6 +1,6 @@
 """The problems of the race: with contact, without, and small enough for a global optimum."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -94,16 +94,14 @@ def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
 
 def small(count: int, seeds: int) -> Iterator[tuple[str, Problem]]:
     """Make problems whose modes a branch and bound can enumerate."""
-    for s in range(seeds):
-        yield "cart-pole, H 10 (2^20 modes)", cart_pole(count, 10, 10 + s)
-    for s in range(seeds):
-        yield "pushing, n_lam 5, H 3 (2^15)", pushing(pushing_model(5, s), count, s, horizon=3)
-    for s in range(seeds):
-        yield "pushing, n_lam 5, H 5 (2^25)", pushing(pushing_model(5, s), count, s)
-    for s in range(seeds):
-        yield "pushing, n_lam 8, H 5 (2^40)", pushing(pushing_model(8, s), count, s)
-    for s in range(seeds):
-        yield "block along a wall, H 4 (2^20)", block(count, 4, s)
+    families: dict[str, Callable[[int], Problem]] = {
+        "cart-pole, H 10 (2^20 modes)": lambda s: cart_pole(count, 10, 10 + s),
+        "pushing, n_lam 5, H 3 (2^15)": lambda s: pushing(pushing_model(5, s), count, s, horizon=3),
+        "pushing, n_lam 5, H 5 (2^25)": lambda s: pushing(pushing_model(5, s), count, s),
+        "pushing, n_lam 8, H 5 (2^40)": lambda s: pushing(pushing_model(8, s), count, s),
+        "block along a wall, H 4 (2^20)": lambda s: block(count, 4, s),
+    }
+    return ((family, make(s)) for family, make in families.items() for s in range(seeds))
 
 
 def block(count: int, horizon: int, seed: int) -> Problem:

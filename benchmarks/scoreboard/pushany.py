@@ -51,10 +51,8 @@ class Options:
     """Plan with what two minutes of random pushing teach about each shape."""
     blind: bool = False
     """Do not tell the policy what is in the way."""
-    shape: str = "all"
-    """One of the shapes, or "all"."""
     json: bool = False
-    """Print a line of JSON: of all shapes together, and with `--shape` of one."""
+    """Print a line of JSON of all shapes together."""
     smoke: bool = False
     """Two shapes, an episode of a few steps each."""
 
@@ -75,7 +73,7 @@ class Played(NamedTuple):
 
 def figures(played: list[Played]) -> dict[str, Any]:
     """Compute the figures of episodes."""
-    success, steps, _, milliseconds, _ = np.array([one.episode for one in played], float).T
+    success, steps, _, milliseconds = np.array([one.episode for one in played], float).T
     reached = [one.episode.success for one in played if one.within_reach]
     displaced = np.concatenate([one.displaced for one in played])
     return {
@@ -91,10 +89,9 @@ def figures(played: list[Played]) -> dict[str, Any]:
 
 def main(o: Options) -> None:
     """Run the episodes, print the figures of each shape and of all."""
-    if o.shape not in (*OBJECT_NAME_LIST, "all") or not 0 <= o.obstacles <= 4:
-        shapes = ", ".join(OBJECT_NAME_LIST)
-        raise InvalidInputError(f"expected 0 to 4 obstacles and a shape of {shapes} or all, got {o}")
-    names = OBJECT_NAME_LIST if o.shape == "all" else [o.shape]
+    if not 0 <= o.obstacles <= 4:
+        raise InvalidInputError(f"obstacles: expected 0 to 4, got {o.obstacles}")
+    names = OBJECT_NAME_LIST
     if o.smoke:
         names, o.episodes = names[:2], 1
     torch.set_num_threads(1)
@@ -111,7 +108,7 @@ def main(o: Options) -> None:
         if not o.json:
             report(name, figures(played))
     if o.json:
-        print(json.dumps({"shape": o.shape, "obstacles": o.obstacles, **figures(everything)}))
+        print(json.dumps({"obstacles": o.obstacles, **figures(everything)}))
     else:
         report("together", figures(everything))
 

@@ -107,14 +107,12 @@ class Episode(NamedTuple):
         steps: until success or the limit.
         coverage: largest part of the goal that the T has covered.
         milliseconds: CPU time of the policy, of all steps.
-        longest: of one step.
     """
 
     success: bool
     steps: int
     coverage: float
     milliseconds: float
-    longest: float
 
 
 def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:
@@ -137,7 +135,7 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
         best = max(best, float(info["coverage"]))
         if success or truncated:
             break
-    return Episode(bool(success), len(times), best, sum(times), max(times))
+    return Episode(bool(success), len(times), best, sum(times))
 
 
 def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
@@ -145,14 +143,13 @@ def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
     policy, limit = variant.policy(o.seed), 5 if o.smoke else STEPS
     policy.adapts = o.adapt
     episodes = [play(env, policy, o.seed + i, variant, limit) for i in range(o.episodes)]
-    success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
+    success, steps, coverage, milliseconds = np.array(episodes, float).T
     return {
         **success_figures(success),
         "mean_steps": float(steps.mean()),
         "worst_steps": float(steps.max()),
         "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
         "coverage": float(coverage.mean()),
-        "longest_milliseconds": float(np.percentile(longest, 99)),
     }
 
 
