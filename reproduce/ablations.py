@@ -15,10 +15,12 @@ from records import Cell, select
 from report import Tables, say
 from units import ABLATED, ABLATION_TASKS
 
-WHEN: dict[str, str | float] = {"6 min": 6.0, "10 min": 10.0, "final": "final"}
+LATE: dict[str, str | float] = {"10 min": 10.0, "final": "final"}
+WHEN = {"6 min": 6.0, **LATE}
 LABELS = {
     **{name: f"with {recipe.label}".replace("with without", "without") for name, recipe in ABLATIONS.items()},
     "no-warm-up": "without warm-up",
+    "all": "all parts",
 }
 NOTE = "LCS-RL in our recipe, without one of its parts each. Differences: without the part − with all, paired by seed."
 Cells = dict[str, Cell]
@@ -27,22 +29,16 @@ Cells = dict[str, Cell]
 
 def table(cells: Cells) -> pd.DataFrame:
     """Make the table of success with and without each part, and of the paired differences."""
-    lines = []
-    for name, cell in cells.items():
-        line = ["all parts" if name == "all" else LABELS[name]]
-        line += [say(report.at(cell, when)) for when in WHEN.values()]
-        for when in list(WHEN.values())[1:]:
-            paired = [] if name == "all" else report.paired(cell, cells["all"], when)
-            line += report.say_difference(paired)
-        lines.append(line)
-    columns = ["", *WHEN, *(f"{label}: {what}" for label in list(WHEN)[1:] for what in ("difference", "p"))]
-    return pd.DataFrame(lines, columns=columns)
+    pairs = {LABELS[name]: (None if name == "all" else cell, cells["all"]) for name, cell in cells.items()}
+    success = {label: [say(report.at(cell, when)) for cell in cells.values()] for label, when in WHEN.items()}
+    apart = report.differences("", pairs, LATE)
+    return pd.concat([apart[[""]], pd.DataFrame(success), apart.drop(columns="")], axis=1)
 
 
 def words(cells: Cells, task: str) -> list[str]:
     """Describe the differences of every part by their intervals, at 10 minutes and at the end."""
     said = []
-    for label, when in list(WHEN.items())[1:]:
+    for label, when in LATE.items():
         apart = {LABELS[n]: report.paired_estimate(c, cells["all"], when) for n, c in cells.items() if n != "all"}
         better, worse, _, unknown = report.sides(apart)
         left = f"; {report.UNTOLD}: {report.listed(unknown)}" if unknown else ""

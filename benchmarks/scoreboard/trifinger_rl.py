@@ -2,12 +2,12 @@
 
 Simulator, task, reward and evaluation are those of the authors (`trifinger_rl_datasets.Evaluation`, PyBullet, torques
 at 50 Hz that act 10 ms late, a pose of the cube that is 90 to 190 ms old, 750 steps). Only the random numbers are
-seeded, for which the authors' `python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.PushPolicy` has no
-option; and the environment is taken out of Gymnasium's wrappers, which since 1.0 hide what the evaluation asks for.
+seeded, for which the authors' `python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.policy.PushPolicy` has
+no option; and the environment is taken out of Gymnasium's wrappers, which since 1.0 hide what the evaluation asks for.
 
 The reward of a step is sech²(15 d), with d [m] the distance of the cube's centre from the goal: at most 750 an episode.
 
-- contact-mpc: `trifinger_push.PushPolicy`, from geometry and friction, no data;
+- contact-mpc: `trifinger_push.policy.PushPolicy`, from geometry and friction, no data;
 - any other name is that of a policy class, as the evaluator takes it. The authors' expert is
   `trifinger_rl_example.example.TorchPushPolicy` of github.com/rr-learning/trifinger-rl-example, to be installed from
   there: it was trained by reinforcement learning in simulation.
@@ -77,7 +77,7 @@ def policy_class(name: str) -> Any:
         raise MissingDependencyError(
             f"expected trifinger-rl-datasets, not installed ({error}); run: pip install trifinger-rl-datasets==1.0.3"
         ) from error
-    return evaluate.load_policy_class("trifinger_push.PushPolicy" if name == OWN else name)
+    return evaluate.load_policy_class("trifinger_push.policy.PushPolicy" if name == OWN else name)
 
 
 def summary(rows: list[list[float]]) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def bullet(policy: Any, environment: str, steps: int, every: int) -> list[np.nda
 
 def trifinger_push(o: Options) -> None:
     """The first five of 15 s of pushing in trifinger-rl-datasets, in real time."""
-    from trifinger_push import PushPolicy
+    from trifinger_push.policy import PushPolicy
 
     save("trifinger_push", bullet(PushPolicy(), "trifinger-cube-push-sim-expert-v0", 240, 4), 12.5, 32)
 

@@ -51,24 +51,14 @@ def _cut(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Compute the convex hull (n, 2), counterclockwise (Andrew's monotone chain)."""
-    points = np.unique(points, axis=0)
-    if len(points) < 3:
-        return points
+    """Compute the convex hull (n, 2), counterclockwise from its leftmost corner; empty where all are in one line."""
+    from scipy.spatial import ConvexHull, QhullError
 
-    def chain(ordered: np.ndarray) -> list[np.ndarray]:
-        kept: list[np.ndarray] = []
-        for p in ordered:
-            while len(kept) >= 2 and _turn(kept[-2], kept[-1], p) <= 0:
-                kept.pop()
-            kept.append(p)
-        return kept[:-1]
-
-    return np.array(chain(points) + chain(points[::-1]))
-
-
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except QhullError:
+        return np.zeros((0, 2))
+    return np.roll(corners, -np.lexsort(corners.T[::-1])[0], axis=0)
 
 
 def _simplify(polygon: np.ndarray) -> np.ndarray:
