@@ -12,6 +12,9 @@ within the step, so that friction is right at every step of a plan. Two models o
 - Anitescu: the rows of J are the extreme rays n ± μ t of the friction cone. F is symmetric. A contact that slides opens
   by μ times the distance that it slides, an error that vanishes with the step.
   (M. Anitescu, "Optimization-based simulation of nonsmooth rigid multibody dynamics", Math. Program. 105, 2006.)
+  Where the load of a contact is known, friction may grow with it up to a cap only: with more load the contact slides
+  without opening (`caps`). Its rays then share σ ≥ 0, and one more force ν acts along the normal alone:
+  0 ≤ λ ⊥ gap along the rays + σ ≥ 0,  0 ≤ σ ⊥ cap − Σ λ + ε σ ≥ 0,  0 ≤ ν ⊥ gap ≥ 0. F + Fᵀ ≻ 0 as before.
 - Stewart-Trinkle: normal force, friction in each direction and sliding distance each have a complementarity condition.
   (D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
   Coulomb friction", Int. J. Numer. Methods Eng. 39, 1996.)
@@ -141,7 +144,7 @@ def given_states(x: Tensor | None) -> Tensor:
 def count_forces(
     n_contacts: int, n_tangents: int, cone: Cone = "anitescu", n_unilateral: int = 0, n_bounded: int = 0
 ) -> int:
-    """Return n_lam of a system with so many contacts, one-sided constraints and bounded forces."""
+    """Return n_lam of a system with so many contacts, one-sided constraints, and bounded forces or caps of friction."""
     rays = 2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2
     return n_contacts * (rays if n_tangents else 1) + n_unilateral + 2 * n_bounded
 
@@ -160,6 +163,7 @@ def contact_lcs(
     rest: Tensor | None = None,
     unilateral: Unilateral | None = None,
     bounded: Bounded | None = None,
+    caps: Tensor | None = None,
 ) -> LCSParams:
     """Build the linear complementarity system of one step with contact, linearised at some states.
 
@@ -179,12 +183,14 @@ def contact_lcs(
             what stands in the place of its s does nothing); None: zero.
         unilateral: one-sided constraints without friction, scaled so that a unit of each gap is a `length`.
         bounded: bounded forces, scaled likewise.
+        caps: (..., n_caps) of the first contacts in Anitescu's cone, > 0: normal forces up to which friction grows.
 
     Returns:
         The system, one per state. A contact has one multiplier without tangents, 2 n_tangents with the cone of
         Anitescu, 2 n_tangents + 2 with that of Stewart and Trinkle. In this order, contact by contact: the rays
         n + μ t, n − μ t of each tangent; or the normal force, friction along t and −t of each, the sliding distance.
-        Then one for each one-sided constraint, λ of all bounded forces, s of all. `count_forces` counts them.
+        Then one for the frictionless force of each contact with a cap, one for each one-sided constraint, λ of all
+        bounded forces, s of all, σ of all caps. `count_forces` counts them.
 
     Warns:
         FrictionWarning: the drag of the Stewart-Trinkle cone holds back much of a slide, see above.
@@ -199,11 +205,21 @@ def contact_lcs(
     n_contacts, n_tangents = contacts.tangent.shape[-3:-1]
     mu = _per_row("friction", friction, contacts.gap, strict=False)
     others = [0 if m is None else m[0].shape[-1] for m in (unilateral, bounded)]
+    n_caps = 0 if caps is None else caps.shape[-1]
     if rest is not None:
-        check_shape("rest", rest, "... n_lam", {"n_lam": count_forces(n_contacts, n_tangents, cone, *others)})
+        n_lam = count_forces(n_contacts, n_tangents, cone, others[0], others[1] + n_caps)
+        check_shape("rest", rest, "... n_lam", {"n_lam": n_lam})
     of_all = contacts.gap.new_empty(n_contacts + sum(others))
     soft = _per_row("compliance", compliance, of_all, strict=True) * (force / length)
-    return LCSParams(**assemble_lcs(contacts, free, x, mu, soft, cone, length, force, rest, unilateral, bounded))
+    if caps is not None:
+        caps = check_shape("caps", caps, "... n_caps").to(x)
+        bad = not is_wrapped(caps) and not bool((caps > 0).all())
+        if bad or cone != "anitescu" or not n_tangents or n_caps > n_contacts:
+            raise InvalidInputError(
+                f"caps: expected positive forces of at most {n_contacts} contacts with tangents, in Anitescu's cone, "
+                f"got {describe(caps)}; give one for each of the first contacts, or none"
+            )
+    return LCSParams(**assemble_lcs(contacts, free, x, mu, soft, cone, length, force, rest, unilateral, bounded, caps))
 
 
 def assemble_lcs(
@@ -218,6 +234,7 @@ def assemble_lcs(
     rest: Any = None,
     unilateral: Unilateral | None = None,
     bounded: Bounded | None = None,
+    caps: Any = None,
 ) -> dict[str, Tensor]:
     """Compute the matrices of `contact_lcs` by name, of its arguments; nothing is checked.
 
@@ -227,7 +244,9 @@ def assemble_lcs(
     """
     of: Any = torch if isinstance(x, Tensor) else np
     n_contacts, n_tangents = contacts.gap.shape[-1], contacts.tangent.shape[-2]
-    more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
+    n_caps = 0 if caps is None else caps.shape[-1]
+    smooth = Unilateral(contacts.gap[..., :n_caps], contacts.normal[..., :n_caps, :])
+    more = [m for m in (smooth, unilateral, bounded) if m is not None and m[0].shape[-1]]
     stewart_trinkle = cone == "stewart-trinkle" and n_tangents > 0 and n_contacts > 0
     directions = _normals_and_tangents if stewart_trinkle else _rays
     rows, normals, gap = directions(contacts, mu) if n_tangents else (contacts.normal, contacts.normal, contacts.gap)
@@ -238,7 +257,8 @@ def assemble_lcs(
         effects = [free.response @ m[1].swapaxes(-1, -2) if m.effect is None else m.effect for m in more]
         counted = [m[1] if isinstance(m, Unilateral) else of.zeros_like(m[1]) for m in more]
         rows, normals = _join(-2, rows, *(m[1] for m in more)), _join(-2, normals, *counted)
-        gap, softness = _join(-1, gap, *(m[0] for m in more)), of.concatenate([softness, soft[..., n_contacts:]], -1)
+        gap, softs = _join(-1, gap, *(m[0] for m in more)), (softness, soft[..., :n_caps], soft[..., n_contacts:])
+        softness = of.concatenate(softs, -1)
         C = _join(-1, C, *(effect * force for effect in effects))
     rows, normals = rows / length, normals / length
     F = rows @ C
@@ -258,6 +278,9 @@ def assemble_lcs(
         system = _limit_friction(system, torch.as_tensor(mu), each, torch.from_numpy(forces).to(system.F.device))
     if bounded is not None and bounded.offset.shape[-1]:
         system = _bound(system, *(torch.as_tensor(v / force) for v in (bounded.lower, bounded.upper)))
+    if caps is not None and n_caps:
+        of_cap = torch.arange(n_caps).repeat_interleave(each)
+        system = _hold(system, torch.arange(n_caps * each), of_cap, torch.as_tensor(caps / force))
     return {"A": A, "B": B, **system._asdict()}
 
 
@@ -275,11 +298,21 @@ class _Rows(NamedTuple):
 def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
     """Give the last forces, of any sign in `system`, their bounds: they become λ + lower, and s is added."""
     C, d, D, E, F, c = system
-    n = lower.shape[-1]
+    n, n_lam = lower.shape[-1], F.shape[-1]
     d, c = d + matvec(C[..., -n:], lower), c + matvec(F[..., -n:], lower)
+    return _hold(_Rows(C, d, D, E, F, c), torch.arange(n_lam - n, n_lam), torch.arange(n), upper - lower)
+
+
+def _hold(system: _Rows, forces: Tensor, groups: Tensor, most: Tensor) -> _Rows:
+    """Let the sum of each group of forces be at most so large (..., n): s is added, one for each group.
+
+    `forces` are numbers of multipliers, in the order of their `groups`. See `Bounded`: 0 ≤ s ⊥ most − Σ λ + ε s ≥ 0.
+    """
+    C, d, D, E, F, c = system
+    n = most.shape[-1]
     held = F.new_zeros(F.shape[-1], n)
-    held[-n:] = torch.eye(n, dtype=F.dtype, device=F.device)
-    drag = torch.diag_embed(_DRAG / F.diagonal(dim1=-2, dim2=-1)[..., -n:])
+    held[forces, groups] = 1.0
+    drag = torch.diag_embed(_DRAG / F.diagonal(dim1=-2, dim2=-1)[..., forces[:: len(forces) // n]])
     held = held.expand(*F.shape[:-1], n)
     F = torch.cat([torch.cat([F, held], -1), torch.cat([-held.mT, drag], -1)], -2)
     C, D, E = (
@@ -290,7 +323,7 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
             (E, (*E.shape[:-2], n, E.shape[-1]), -2),
         )
     )
-    return _Rows(C, d, D, E, F, _join(-1, c, upper - lower))
+    return _Rows(C, d, D, E, F, _join(-1, c, most))
 
 
 def _join(dim: int, *parts: Any) -> Any:

@@ -166,6 +166,19 @@ def test_a_push_within_the_cone_moves_nothing_and_units_do_not_matter(cone):
     torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("press", [0.0, 9.81])
+def test_a_block_whose_friction_has_a_cap_slides_without_opening(press):
+    """Friction follows the load up to a cap, here the impulse of the weight in a step; with more it stays as it is."""
+    lcs, x = sliding_block(caps=tensor([0.981]))
+    assert lcs.n_lam == count_forces(1, 1, n_bounded=1)
+    after = lcs.step(x, tensor([7.0, -press])).x_next
+    torch.testing.assert_close(after, (7.0 - 0.5 * 9.81) * tensor([0.01, 0.0, 0.1, 0.0]), rtol=2e-3, atol=1e-4)
+    lifted = sliding_block(caps=tensor([0.981]), x=tensor([0.0, 1.0, 0.0, 0.0]))[0]
+    after = lifted.step(tensor([0.0, 1.0, 0.0, 0.0]), tensor([7.0, 0.0])).x_next
+    torch.testing.assert_close(after[2], tensor(0.7), rtol=0, atol=1e-3)
+    refuse(InvalidInputError, "caps: expected positive forces", sliding_block, caps=tensor([0.0]))
+
+
 def test_a_drag_that_spoils_the_friction_is_told():
     """A block on two feet that share its weight."""
     sliding_block("anitescu", 1e-3, feet=2)

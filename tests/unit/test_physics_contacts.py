@@ -11,6 +11,7 @@ import torch
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco import Distance, MujocoCost, MujocoLCS
 from difflcs.physics.mujoco.nominal import solve_soft
+from tests.conftest import refuse
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
 CUBE = " ".join(f"{x} {y} {z}" for x in (-0.04, 0.04) for y in (-0.03, 0.05) for z in (-0.02, 0.03))
@@ -208,3 +209,31 @@ def test_surfaces_that_move_or_stick_are_left_out_with_a_warning(surface):
     with pytest.warns(ContactWarning, match="neither move nor stick|holds still") as said:
         step_of(floor=surface)
     assert len(said) == 1 + ("vel" in surface)  # what such a surface moves holds still here
+
+
+@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")
+@pytest.mark.parametrize(("motion", "nearest"), [("dynamic", 0.2), ("quasi-dynamic", 0.4)])
+def test_friction_of_one_on_both_sides_does_not_jam(motion, nearest):
+    """A finger that cannot rise pushes a box over a floor, as fast as in MuJoCo; without caps it hardly moves."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .05"><freejoint/><geom type="box" size=".05 .05 .05" mass=".2"/></body>
+    <body pos="-.061 0 .05"><joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size=".01" mass=".1"/></body>
+    </worldbody><actuator><position joint="x" kp="100" ctrlrange="-.2 .2"/></actuator></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 300)
+    data.qvel[:] = 0
+    moved = []
+    for caps in (None, 0):
+        module = MujocoLCS(model, data, motion=motion, seconds=0.05, caps=caps)
+        system = module.params(x := module.observe(data))
+        assert module.n_lam == system.n_lam == 6 * 4 + 8 * (caps is None)
+        u = torch.tensor([0.1], dtype=torch.float64)
+        change = system.step(x, u).x_next - x
+        moved.append(float(change[model.nv if motion == "dynamic" else 0]))
+    data.ctrl[:] = module.control(x, u)
+    before = data.qpos[0]
+    mujoco.mj_step(model, data, 25)
+    true = data.qvel[0] if motion == "dynamic" else data.qpos[0] - before
+    assert abs(moved[0] - true) < nearest * true
+    assert moved[1] < 0.2 * true
+    refuse(InvalidInputError, "caps: expected at most 6, got 7", MujocoLCS, model, motion="dynamic", caps=7)

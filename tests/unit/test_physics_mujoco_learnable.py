@@ -16,7 +16,7 @@ from tests.conftest import F64, refuse
 
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
 VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0, "loss": 0.2, "torsion": 0.01}
-OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6}
+OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6, "caps": 4}
 
 
 def scene(**changed):
@@ -84,7 +84,7 @@ def test_it_is_the_system_of_the_changed_model(motion, learn, change, changed):
 @pytest.mark.parametrize(("motion", "tolerance"), [("dynamic", 0.02), ("quasi-dynamic", 1e-4)])
 def test_gradients_are_slopes_of_the_matrices(motion, tolerance):
     learn = [("mass", "cube"), ("friction", "block"), ("size", "tip"), ("center_of_mass", "cube"), "gain", "compliance"]
-    learned = LearnableMujocoLCS(scene(), learn=learn, motion=motion, **OPTIONS)
+    learned = LearnableMujocoLCS(scene(), learn=learn, motion=motion, **OPTIONS | {"caps": 0})  # loads of corners bend
     x, ctrl = states(learned.n_x, seed=1)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
     generator = torch.Generator().manual_seed(1)
     weights = {k: torch.randn(v.shape, generator=generator, dtype=F64) for k, v in learned.params(x).tensors().items()}

@@ -66,10 +66,10 @@ class MujocoContacts(NamedTuple):
     friction: Array
     geom: NDArray[np.intp]
 
-    def take(self, which: NDArray[np.bool_]) -> MujocoContacts:
-        """Return those of a mask (n_contacts,)."""
-        gap, normal, tangent, friction = (values[:, which] for values in self[:4])
-        return MujocoContacts(gap, normal, tangent, friction, self.geom[:, which])
+    def take(self, which: Any) -> MujocoContacts:
+        """Return those of an index of the first two dimensions."""
+        gap, normal, tangent, friction = (values[which] for values in self[:4])
+        return MujocoContacts(gap, normal, tangent, friction, self.geom[which])
 
 
 class Budget(NamedTuple):
@@ -109,6 +109,7 @@ class ContactFinder:
         axis: normal (3,) of the plane in which everything moves, or None.
         pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
         main_pairs: those of the first budget.
+        rubbing: (ngeom, ngeom) True for those with friction.
         n_contacts: number of contacts of every state.
         n_tangents: of each contact; the third, where there is torsional friction, is the spin about the normal times
             the radius at which sliding friction would hold it back as much.
@@ -146,12 +147,12 @@ class ContactFinder:
                 "conaffinity of geoms fit, on bodies that move and are not fixed to each other, and enable contacts",
                 ContactWarning,
             )
-        kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
         if contacts is None:
-            contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))
+            contacts = min(MOST_CONTACTS, count_points(model, self.pairs))
         budgets = [Budget(self.allowed, contacts, distance)] if isinstance(contacts, int) else list(contacts)
         self.main_pairs = [side[budgets[0].pairs[first, second]] for side in self.pairs]
         self.n_contacts = sum(budget.contacts for budget in budgets)
+        self.rubbing = self.allowed & (self.friction > 0) & np.any([b.pairs for b in budgets if b.friction], 0)
         self.n_tangents = (1 if self.axis is not None else 2) if (self.friction[first, second] > 0).any() else 0
         self._spin = _coefficients(model, 1) / np.where(self.friction > 0, self.friction, np.inf)
         if torsion and self.n_tangents == 2:
@@ -209,7 +210,7 @@ class ContactFinder:
             "kind": kind.astype(np.int64),
             "root": model.body_rootid[model.geom_bodyid].astype(np.int64),
             "solid": number.astype(np.int64),
-            "moves": _moves(model)[model.geom_bodyid],
+            "moves": find_moving(model)[model.geom_bodyid],
             "solids": [describe_solid(model, int(geom)) for geom in solids],
             "geoms": np.stack([first, second], -1).astype(np.int64),
             "flags": np.stack([formula, boxes, meet], -1),
@@ -255,7 +256,13 @@ class ContactFinder:
             self._warn_within = -np.inf
 
 
-def _moves(model: Any) -> NDArray[np.bool_]:
+def count_points(model: Any, pairs: Sequence[NDArray[np.intp]]) -> int:
+    """Count the contacts that the shapes of pairs of geoms can have."""
+    kinds = np.sort(model.geom_type[np.stack(pairs, -1)], axis=-1)
+    return sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds)
+
+
+def find_moving(model: Any) -> NDArray[np.bool_]:
     """Return a mask (nbody, nv), True where a degree of freedom moves a body."""
     moves = np.zeros((model.nbody, model.nv), dtype=bool)
     for body in range(1, model.nbody):
@@ -370,7 +377,7 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
         excluded = (body[:, None] == signature >> 16) & (body[None] == signature & 0xFFFF)
         allowed &= ~(excluded | excluded.T)
     allowed[model.pair_geom1, model.pair_geom2] = allowed[model.pair_geom2, model.pair_geom1] = True
-    moves = _moves(model)[body].any(-1, keepdims=True)  # mocap bodies do not
+    moves = find_moving(model)[body].any(-1, keepdims=True)  # mocap bodies do not
     return allowed & (moves | moves.T)
 
 

@@ -101,9 +101,9 @@ def correct(
         step: the motion without constraints.
         after: (n, 2 nv + na) after MuJoCo's step, see `WholeStep`; states with NaN stay as they are.
         tangent: of the states' rotations, see `MujocoState.tangent`.
-        bound: (n, n_bounded) of dry friction, the last forces of the systems but those of servos.
+        bound: (n, n_bounded) of dry friction, the forces after those of limits.
         rows: limits and dry friction.
-        hard: (n, k) False for the forces of soft contacts, among the first k.
+        hard: (n, k) of the k forces of contacts, which are the first; False for those of soft contacts.
         servos: how many have limits of their force, two multipliers each.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
@@ -112,7 +112,7 @@ def correct(
     C, of_servos = np.split(C, [C.shape[2] - 2 * servos], 2)
     lam = lam[:, : C.shape[2]]
     n_bounded, lower = bound.shape[1], np.zeros_like(lam)
-    n_contacts = lam.shape[1] - 2 * n_bounded - (n_limits := rows.gap.shape[1] - n_bounded)
+    n_contacts, n_limits = hard.shape[1], rows.gap.shape[1] - n_bounded
     lower[:, n_contacts + n_limits :][:, :n_bounded] = -bound
     C, d, forces = C.copy(), d.copy(), lam + lower
     place = after[:, :nv] if tangent is None else np.linalg.solve(tangent, after[:, :nv, None])[:, :, 0]
@@ -128,7 +128,7 @@ def correct(
         return np.sqrt((moved[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0])
 
     energy = mass.swapaxes(-1, -2) @ (C[:, nv : 2 * nv] * forces[:, None]) ** 2
-    energy[:, :, : hard.shape[1]] *= hard[:, None]  # soft contacts press all the time, whatever moves
+    energy[:, :, :n_contacts] *= hard[:, None]  # soft contacts press all the time, whatever moves
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)

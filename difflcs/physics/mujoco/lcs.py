@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -14,28 +14,21 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from difflcs._checks import check_array, check_choice, check_kind, check_number, check_tensor, takes_arrays
-from difflcs.physics.complementarity import (
-    Bounded,
-    Cone,
-    Contacts,
-    FreeMotion,
-    Unilateral,
-    assemble_lcs,
-    count_forces,
-    given_states,
-)
+from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, assemble_lcs, count_forces, given_states
 from difflcs.physics.mujoco.actuators import Actuators, check_model
-from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, median_apart, typical_radius
+from difflcs.physics.mujoco.caps import Caps
+from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
-from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale, soften
+from difflcs.physics.mujoco.limits import RowFinder, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
 from difflcs.physics.mujoco.nominal import Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
+from difflcs.physics.mujoco.readings import Readings
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
@@ -96,6 +89,8 @@ class MujocoLCS:
             geoms that move and may touch.
         limits: how many limits of joints and tendons a state has, those that the nominal action comes nearest to; None:
             all, at most 8, with a `ContactWarning` where more act. 0 leaves them out, and limits of forces of servos.
+        caps: how many contacts have a cap of friction in dynamic motion with Anitescu's cone, between bodies without
+            drives, see `caps.py`; None: where friction may jam. They come first, and take two forces more each.
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
@@ -123,6 +118,7 @@ class MujocoLCS:
         ctrl: ArrayLike | None = None,
         length: float | None = None,
         limits: int | None = None,
+        caps: int | None = None,
     ):
         options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
         friction, torsion = _check_options(motion, cone, mobility, friction, torsion, relative)
@@ -165,6 +161,8 @@ class MujocoLCS:
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
+        caps = 0 if motion == "quasi-static" or cone != "anitescu" else caps
+        self._caps = Caps(model, self._servos.moment, self._finder, length, caps)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         self._touching = copy.copy(model)
         self._touching.opt.disableflags &= ~flags("CONTACT")
@@ -194,7 +192,7 @@ class MujocoLCS:
     def n_lam(self) -> int:
         """Number of forces: of contacts, those without friction last, of limits, two of each dry friction and servo."""
         rough, rows = int(self._finder.rough.sum()), self._rows
-        more = self.n_contacts - rough + rows.n_limits, rows.n_friction + len(self._servos.those)
+        more = self.n_contacts - rough + rows.n_limits, rows.n_friction + len(self._servos.those) + self._caps.count
         return count_forces(rough, self._finder.n_tangents, self.cone, *more)
 
     @in_turn
@@ -227,6 +225,7 @@ class MujocoLCS:
         """
         read = self._read(x := given_states(x), context)
         contacts, rough, rest, step, overlaps = read.dof_contacts, self._finder.rough, None, None, None
+        unit, loads = self.length / self._give, None
         if isinstance(self._motion, Dynamic):
             middle = read.moved.middle[:, : self.state.nv]
             step = self._motion.finish(read.moved, read.x, self._equality.read(read.qpos, middle))
@@ -236,7 +235,8 @@ class MujocoLCS:
             overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
             nominal = overlaps.evaluate(at)
             contacts, rows = nominal.contacts, nominal.rows
-            rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone))
+            rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone, self._caps.count))
+            loads, response = nominal.forces[:, rough].sum(-1), step.response
             free = step.free(read.tangent, nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
@@ -244,9 +244,10 @@ class MujocoLCS:
             response = np.broadcast_to(read.to_dofs(free.response), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
+        caps = read.batched(self._caps.limit(contacts, loads, response, unit))
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
-            contacts = contacts.take(rough)
+            contacts = contacts.take(np.s_[:, rough])
         soft = np.full_like(contacts.gap, self.compliance) if overlaps is None else overlaps.compliance[:, rough]
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         matrices = assemble_lcs(
@@ -257,18 +258,20 @@ class MujocoLCS:
             read.batched(soften(rows, found, step, self._give, self.compliance, soft)),
             self.cone,
             self.length,
-            self.length / self._give,
+            unit,
             rest,
             **read.constraints(rows, effect),
+            caps=caps,
         )
         system = LCSParams.of_fitting(matrices)
+        system = self._caps.limit_by_forces(system, read, response) if step is None else system
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
             after = self._whole.simulate(self._places, read.states, idle)
-            rubs, each = rows.bound * self._give / self.length, count_forces(1, self._finder.n_tangents, self.cone)
-            hard, servos = np.repeat(~overlaps.soft[:, rough], each, 1), len(self._servos.those)
-            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found, hard, servos)
+            hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
+            more = rows.bound / unit, found, hard, len(self._servos.those)
+            system, read.doubtful[:] = correct(system, step, after, read.tangent, *more)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
@@ -324,88 +327,24 @@ class MujocoLCS:
         low, high = (torch.from_numpy(v).to(x) for v in bounds)
         return low, high
 
-    def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
+    def _read(self, x: Tensor, context: Tensor | None = None) -> Readings:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
         flat = to_numpy(x).reshape(n, self.n_x)
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
-        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
+        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._caps.order(self._finder.find(qpos))
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        moved = self._read_motion(states, ctrl)
+        moved = read_each(self._motion, self._places, self._model, self._data, states, ctrl)
         if isinstance(self._motion, Dynamic):
             moved = self._motion.find_secants(moved, self._places, states, flat)
-        return _States(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
-
-    def _read_motion(self, states: Any, ctrl: Any) -> Any:
-        """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
-        if isinstance(self._motion, Dynamic):
-            return self._motion.read(self._places, states, ctrl)
-        return read_each(self._motion, self._model, self._data, states, ctrl)
-
-
-class _States(NamedTuple):
-    """Contacts and motion that were read at n states.
-
-    Attributes:
-        batch: their batch dimensions.
-        x: (n, n_x).
-        states: (n, nq + nv + na) MuJoCo's.
-        qpos: (n, nq).
-        tangent: of their rotations, see `MujocoState.tangent`.
-        dof_contacts: contacts.
-        moved: buffers of the motion.
-        doubtful: (n,) True where actions are to be tried.
-    """
-
-    batch: torch.Size
-    x: Any
-    states: Any
-    qpos: Any
-    tangent: Any
-    dof_contacts: MujocoContacts
-    moved: Any
-    doubtful: Any
-
-    def batched(self, value: Any) -> Any:
-        """Give an array (n, ...) the batch dimensions."""
-        return value.reshape(*self.batch, *value.shape[1:])
-
-    def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
-        """Convert derivatives by the degrees of freedom to derivatives by the state."""
-        return Contacts(
-            self.batched(dof_contacts.gap), self._of_state(dof_contacts.normal), self._of_state(dof_contacts.tangent)
-        )
-
-    def constraints(self, rows: ScaledRows, effect: Any) -> dict[str, Any]:
-        """Return rows that are no contacts as arguments of `contact_lcs`; `effect` (n, n_x, k) as there."""
-        k = rows.gap.shape[1] - rows.bound.shape[1]
-        gap, along = self.batched(rows.gap), self._of_state(rows.normal)
-        effects = [None, None] if effect is None else [self.batched(effect[:, :, :k]), self.batched(effect[:, :, k:])]
-        bound, found = self.batched(rows.bound), {}
-        if k:
-            found["unilateral"] = Unilateral(gap[..., :k], along[..., :k, :], effects[0])
-        if rows.bound.shape[1]:
-            found["bounded"] = Bounded(gap[..., k:], along[..., k:, :], -bound, bound, effects[1])
-        return found
-
-    def to_dofs(self, response: Any) -> Any:
-        """Convert a response (..., nv, nv) of the positions of the state to one of the degrees of freedom."""
-        return response if self.tangent is None else self.tangent @ response @ self.tangent.swapaxes(-1, -2)
-
-    def _of_state(self, rows: Any) -> Any:
-        """Convert derivatives (n, ..., nv) by the degrees of freedom to derivatives by the state."""
-        if self.tangent is not None:
-            rows = rows @ (self.tangent if rows.ndim == 3 else self.tangent[:, None])
-        if still := self.x.shape[-1] - rows.shape[-1]:
-            rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1)
-        return self.batched(rows)
+        return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
 
 
 def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
-    moved = of._read_motion(here, of._ctrl[None])
+    moved = read_each(of._motion, of._places, model, data, here, of._ctrl[None])
     x = np.zeros((1, of.n_x))
     if not isinstance(of._motion, Dynamic):
         response = far = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
@@ -420,7 +359,7 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     return median_apart(model, data, here[0], response, finder.main_pairs, dimensions), yields
 
 
-def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
+def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
     first, of._tried = not of._tried, True
     if step is None or of._whole is None:

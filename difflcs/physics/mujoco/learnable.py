@@ -107,7 +107,8 @@ class LearnableMujocoLCS(nn.Module):
         self._model, self.state = copy.copy(model), first.state
         self.n_x, self.n_u, self.n_lam = first.n_x, first.n_u, first.n_lam
         self._data = mujoco.MjData(model) if data is None else copy.copy(data)
-        self._options = {"compliance": first.compliance, **options, "length": first.length}
+        fixed = {"length": first.length, "caps": first._caps.count}
+        self._options = {"compliance": first.compliance, **options, **fixed}
         if self._options.get("contacts") is None:  # the first has warned if these are too few
             self._options["contacts"] = first.n_contacts or None
         self._entries: list[_Entry] = []

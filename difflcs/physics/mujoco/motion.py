@@ -124,12 +124,14 @@ class QuasiStatic:
         return FreeMotion(*matrices)
 
 
-def read_each(motion: Any, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
-    """Read a motion of positions at states (n, nq + nv + na), one after the other, with nominal controls (n, nu).
+def read_each(motion: Any, places: Places, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
+    """Read a motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu); of positions one by one.
 
     Raises:
         InvalidInputError: MuJoCo raised an error, or has counted a warning.
     """
+    if isinstance(motion, Dynamic):
+        return motion.read(places, states, ctrl)
     moved = motion.allocate(len(states))
     for i, state in enumerate(states):
         with native(model, data, f"in state {i} of {len(states)}"):

@@ -52,14 +52,15 @@ class Nominal(NamedTuple):
     row_forces: Array
     carried: Array
 
-    def rest(self, rough: NDArray[np.bool_], n_tangents: int, cone: Cone) -> Array:
+    def rest(self, rough: NDArray[np.bool_], n_tangents: int, cone: Cone, n_caps: int) -> Array:
         """Forces (n, n_lam) from which the compliance counts, as `contact_lcs` has them for a cone."""
         forces, smooth = self.forces[:, rough], self.forces[:, ~rough].sum(-1)
         each = count_forces(1, n_tangents, cone)
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        slid = np.zeros_like(self.rows.bound)
-        return np.concatenate([forces.reshape(len(forces), each * forces.shape[1]), smooth, self.row_forces, slid], -1)
+        rays, slid = forces.reshape(len(forces), each * forces.shape[1]), np.zeros_like(self.rows.bound)
+        caps = np.zeros((len(forces), n_caps))  # what has one rests on its rays
+        return np.concatenate([rays, caps, smooth, self.row_forces, slid, caps], -1)
 
 
 class Recovery:

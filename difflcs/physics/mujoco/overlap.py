@@ -35,6 +35,11 @@ class Overlaps(NamedTuple):
     gap: Array
     compliance: Array
 
+    def find_hard(self, rough: NDArray[np.bool_], each: int, n_caps: int) -> NDArray[np.bool_]:
+        """Mask (n, k) of the forces of contacts, `each` of those that are rough: False for those of soft contacts."""
+        others = np.full((len(self.soft), (~rough).sum() + n_caps), True)
+        return np.concatenate([np.repeat(~self.soft[:, rough], each, 1), others], 1)
+
     def evaluate(self, at: Situation) -> Nominal:
         """Evaluate all else at the nominal action, with friction that holds, and add the soft contacts of a step."""
         normal, hard = at.contacts.normal, ~self.soft[:, :, None]

@@ -45,16 +45,17 @@ class Servos:
 
     Attributes:
         those: (k,) their numbers; none before `choose`.
+        moment: (nu, nv) derivative of the actuators' lengths.
     """
 
     def __init__(self, model: Any, data: Any, actuators: Actuators, relative: bool, seconds: float, dynamic: bool):
         self.actuators, self.those = actuators, np.zeros(0, dtype=np.intp)
         self._model, self._relative = model, actuators.servo & relative
         self._seconds, self._dynamic = seconds, dynamic
-        self._moment = np.zeros((model.nu, model.nv))
+        self.moment = np.zeros((model.nu, model.nv))
         if model.nu:
             mujoco.mju_sparse2dense(
-                self._moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+                self.moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
             )
         self._resists = -actuators.bias - actuators.damping * (dynamic / seconds)
 
@@ -65,7 +66,7 @@ class Servos:
             ContactWarning: servos with activation in dynamic motion, and those on anything else, have no limits.
         """
         of, least = self.actuators, np.abs(self.actuators.force).min(0)
-        left = 1 - self._resists * ((self._moment @ response) * self._moment).sum(-1)
+        left = 1 - self._resists * ((self.moment @ response) * self.moment).sum(-1)
         weak = of.affine & (left < _WEAK) & (np.ptp(of.range, axis=0) * np.abs(of.gain) > least) & np.isfinite(least)
         limited = of.straight & ~(np.isin(np.arange(len(least)), of.activated) & self._dynamic)
         self.those = np.flatnonzero(weak & limited)
@@ -93,7 +94,7 @@ class Servos:
         those, of, (n, n_x), nu = self.those, self.actuators, read.x.shape, len(self._relative)
         if not (k := len(those)):
             return system
-        x, moved, nominal, rows = read.x, read.moved, read.moved.nominal, self._moment[those]
+        x, moved, nominal, rows = read.x, read.moved, read.moved.nominal, self.moment[those]
         nv, batch, of_step = rows.shape[1], system.C.shape[:-2], self._seconds if self._dynamic else 1.0
 
         def along(change: Array) -> Array:
