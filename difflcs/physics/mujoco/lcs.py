@@ -89,8 +89,8 @@ class MujocoLCS:
             geoms that move and may touch.
         limits: how many limits of joints and tendons a state has, those that the nominal action comes nearest to; None:
             all, at most 8, with a `ContactWarning` where more act. 0 leaves them out, and limits of forces of servos.
-        caps: how many contacts have a cap of friction in dynamic motion with Anitescu's cone, between bodies without
-            drives, see `caps.py`; None: where friction may jam. They come first, and take two forces more each.
+        caps: how many contacts between bodies without drives have a cap of friction, see `caps.py`; 0 in quasi-static
+            motion and with another cone. None: where friction may jam. They come first and take two more forces each.
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
