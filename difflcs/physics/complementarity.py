@@ -205,20 +205,20 @@ def contact_lcs(
     n_contacts, n_tangents = contacts.tangent.shape[-3:-1]
     mu = _per_row("friction", friction, contacts.gap, strict=False)
     others = [0 if m is None else m[0].shape[-1] for m in (unilateral, bounded)]
+    if caps is not None:
+        caps = check_shape("caps", caps, "... n_caps").to(x)
+        bad = not is_wrapped(caps) and not bool((caps > 0).all())
+        if bad or cone != "anitescu" or not n_tangents or caps.shape[-1] > n_contacts:
+            raise InvalidInputError(
+                f"caps: expected positive forces of at most {n_contacts} contacts with tangents, in Anitescu's cone, "
+                f"got {describe(caps)}; give one for each of the first contacts, or none"
+            )
     n_caps = 0 if caps is None else caps.shape[-1]
     if rest is not None:
         n_lam = count_forces(n_contacts, n_tangents, cone, others[0], others[1] + n_caps)
         check_shape("rest", rest, "... n_lam", {"n_lam": n_lam})
     of_all = contacts.gap.new_empty(n_contacts + sum(others))
     soft = _per_row("compliance", compliance, of_all, strict=True) * (force / length)
-    if caps is not None:
-        caps = check_shape("caps", caps, "... n_caps").to(x)
-        bad = not is_wrapped(caps) and not bool((caps > 0).all())
-        if bad or cone != "anitescu" or not n_tangents or n_caps > n_contacts:
-            raise InvalidInputError(
-                f"caps: expected positive forces of at most {n_contacts} contacts with tangents, in Anitescu's cone, "
-                f"got {describe(caps)}; give one for each of the first contacts, or none"
-            )
     return LCSParams(**assemble_lcs(contacts, free, x, mu, soft, cone, length, force, rest, unilateral, bounded, caps))
 
 

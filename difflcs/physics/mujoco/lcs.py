@@ -190,7 +190,7 @@ class MujocoLCS:
 
     @property
     def n_lam(self) -> int:
-        """Number of forces: of contacts, those without friction last, of limits, two of each dry friction and servo."""
+        """Number of forces: of contacts, those without friction last, limits, pairs of dry friction, servos, caps."""
         rough, rows = int(self._finder.rough.sum()), self._rows
         more = self.n_contacts - rough + rows.n_limits, rows.n_friction + len(self._servos.those) + self._caps.count
         return count_forces(rough, self._finder.n_tangents, self.cone, *more)
