@@ -10,6 +10,7 @@ from difflcs._storage import write_atomically
 require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
+from difflcs.rl import methods
 from difflcs.rl.learning.critic import CriticSettings
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.lcsrl import LCSRL
@@ -22,23 +23,7 @@ from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.learning.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.learning.warmup import Warmup, WarmupSettings, action_support, fit
-from difflcs.rl.methods import (
-    ContactMethod,
-    FrameMethod,
-    ImproveMethod,
-    LCSMethod,
-    LCSRLMethod,
-    Method,
-    MujocoMethod,
-    PDDMMethod,
-    PPOMethod,
-    PPOMLPMethod,
-    ViolationMethod,
-    Work,
-    get_method,
-    method_names,
-    register_method,
-)
+from difflcs.rl.methods import *  # noqa: F403
 from difflcs.rl.rollout import collect
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.runs.evaluate import Evaluation, evaluate, wilson_interval
@@ -55,29 +40,19 @@ __all__ = [
     "PDDM",
     "PPO",
     "Adam",
-    "ContactMethod",
     "CriticSettings",
     "Ensemble",
     "EnsembleSettings",
     "Epochs",
     "Evaluation",
-    "FrameMethod",
-    "ImproveMethod",
     "LCSMPCPolicy",
-    "LCSMethod",
-    "LCSRLMethod",
     "MLPController",
     "MLPPolicy",
-    "Method",
     "ModelRolloutSettings",
     "ModelRollouts",
-    "MujocoMethod",
     "Natural",
     "NaturalGradient",
-    "PDDMMethod",
     "PDDMSettings",
-    "PPOMLPMethod",
-    "PPOMethod",
     "PPOSettings",
     "PhysicsFit",
     "PhysicsFitSettings",
@@ -92,16 +67,13 @@ __all__ = [
     "TrainedPolicy",
     "Trainer",
     "ViolationLoss",
-    "ViolationMethod",
     "Warmup",
     "WarmupSettings",
-    "Work",
     "action_support",
     "bounded",
     "collect",
     "evaluate",
     "fit",
-    "get_method",
     "get_task",
     "group",
     "load_checkpoint",
@@ -109,8 +81,6 @@ __all__ = [
     "load_policy",
     "make_actor",
     "make_ppo",
-    "method_names",
-    "register_method",
     "register_task",
     "save_checkpoint",
     "task_names",
@@ -118,6 +88,7 @@ __all__ = [
     "wilson_interval",
     "write_atomically",
 ]
+__all__ += methods.__all__
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
 """Methods of learning, one file each. Other packages register theirs by `register_method`."""
 
-from difflcs.rl.methods.base import LCSMethod, Method, Work, check_fits, get_method, method_names, register_method
+from difflcs.rl.methods.base import LCSMethod, Method, Work, get_method, method_names, register_method
 from difflcs.rl.methods.contact_lcs import ContactMethod
 from difflcs.rl.methods.frame_lcs import FrameMethod
 from difflcs.rl.methods.improve import ImproveMethod
@@ -12,7 +12,6 @@ from difflcs.rl.methods.ppo_mlp import PPOMLPMethod
 from difflcs.rl.methods.violation import ViolationMethod
 
 __all__ = [
-    "DEFAULT_METHOD",
     "ContactMethod",
     "FrameMethod",
     "ImproveMethod",
@@ -25,7 +24,6 @@ __all__ = [
     "PPOMethod",
     "ViolationMethod",
     "Work",
-    "check_fits",
     "get_method",
     "method_names",
     "register_method",

@@ -18,7 +18,8 @@ from difflcs._storage import check_path, short, write_json
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.rl.learning.trainer import Trainer, save_learned
-from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, check_fits, get_method
+from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, get_method
+from difflcs.rl.methods.base import check_fits
 from difflcs.rl.rollout import Policy
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replace_run, save_checkpoint, wrap_os_errors
 from difflcs.rl.runs.evaluate import Evaluation, evaluate
