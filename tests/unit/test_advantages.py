@@ -14,6 +14,7 @@ from difflcs.rl.learning.advantages import MultiActionAdvantages, RewardScale, m
 from difflcs.rl.learning.critic import Critic, returns
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
+from tests.conftest import refuse
 
 STEPS = 6
 
@@ -55,8 +56,7 @@ def test_rewards_are_those_of_the_rule(case):
 def test_rewards_that_are_not_finite_are_refused(bad):
     rewards = torch.zeros(2, 3).double()
     rewards[1, 1] = bad
-    with pytest.raises(InvalidInputError, match="finite rewards"):
-        RewardScale(3.0, 10.0, 0.1)(rewards, torch.ones(2, dtype=torch.bool))
+    refuse(InvalidInputError, "finite rewards", RewardScale(3.0, 10.0, 0.1), rewards, torch.ones(2, dtype=torch.bool))
 
 
 def make_critic(gamma: float = 0.9, zeta: float = 0.8) -> Critic:

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from benchmarks.models import chain_of_carts, push_the_last_cart
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs._native import _kernels
 from difflcs.errors import SolveWarning
@@ -160,18 +161,6 @@ def test_an_unstable_plant_starts_from_its_feedback_law():
     assert float((costs(mpc, x0) <= 1.001 * costs(mpc, x0, restarts=32)).double().mean()) >= 0.9
 
 
-def carts(count, dt, gap, softness, damping=0.0, walls=True):
-    """Carts in a row, between two walls or without: the first one pushes the others."""
-    eye, zero = torch.eye(count).double(), torch.zeros(count, count).double()
-    gaps = torch.cat([eye[:1], eye[1:] - eye[:-1], -eye[-1:]])
-    gaps = gaps if walls else gaps[1:-1]
-    A = torch.cat([torch.cat([eye, dt * eye], 1), torch.cat([zero, (1 - damping) * eye], 1)])
-    B, C = torch.cat([dt * dt * eye[:, :1], dt * eye[:, :1]]), torch.cat([dt * dt * gaps.T, dt * gaps.T])
-    measured = torch.cat([gaps, 0 * gaps], 1)
-    F, c = measured @ C + softness * torch.eye(len(gaps)).double(), torch.full((len(gaps),), gap).double()
-    return LCSParams(A=A, B=B, C=C, d=0 * A[0], D=measured @ A, E=measured @ B, F=F, c=c)
-
-
 def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
     """Every start holds an upright pole; one that falls onto a wall has more optima."""
     mpc = upright(30)
@@ -186,10 +175,7 @@ def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
 @pytest.mark.parametrize(("limit", "effort"), [(50.0, "default"), (float("inf"), "best")])
 def test_a_contact_that_is_far_is_found(limit, effort):
     """Three carts in a row: only who strikes the first one at once moves the last one before the end."""
-    Q = diagonal(0.1, 0.0, 10.0, 0.01, 0.01, 0.01)
-    q = torch.tensor([0.0, 0.0, -3.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # the last one shall be at 0.3
-    cost = QuadraticCost(Q, diagonal(1e-4), 10 * Q, q=q, q_final=10 * q)
-    mpc = LCSMPCLayer(carts(3, 0.1, 0.2, 1e-3, walls=False), cost, 10, -limit, limit)
+    mpc = LCSMPCLayer(chain_of_carts(3, 0.1, 1e3), push_the_last_cart(3, 10), 10, -limit, limit)
     x0 = torch.randn(32, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.1
     x0[:, 3:] = 0
     ours, best = costs(mpc, x0, effort=effort), costs(mpc, x0, restarts=64)
@@ -315,7 +301,7 @@ def test_iterations_hardly_grow_with_the_horizon():
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)
     x0 = low * (2 * torch.rand(8, 8, generator=torch.Generator().manual_seed(0)).double() - 1)
     goal = torch.tensor([0.2] * 4 + [0.0] * 4, dtype=torch.float64)
-    lcs, backend = carts(4, 0.05, 0.1, 0.02, damping=0.02), BatchedBackend(threads=1, restarts=1)
+    lcs, backend = chain_of_carts(4, 0.05, 50.0), BatchedBackend(threads=1, restarts=1)
     means = []
     for horizon in (10, 40):
         mpc = LCSMPCLayer(lcs, cost, horizon, -5.0, 5.0, backend=backend, relaxation=1e-4)

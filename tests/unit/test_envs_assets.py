@@ -18,6 +18,7 @@ import trimesh
 from difflcs_envs import AssetError, MeshError, MissingDependencyError, assets
 from difflcs_envs.trifinger.objects import make_object
 from difflcs_envs.ycb import YCB
+from tests.conftest import refuse
 
 MESH = "004_sugar_box/google_16k/nontextured.stl"
 ARCHIVE = "004_sugar_box_google_16k.tgz"
@@ -97,8 +98,7 @@ def test_an_interrupted_download_is_tried_again(server, tmp_path, monkeypatch):
     assert server.requests == 2
     server.cuts = (100, 50)
     monkeypatch.setattr(assets, "ATTEMPTS", 2)
-    with pytest.raises(AssetError, match=r"run the command again"):
-        fetch(server, tmp_path / "other")
+    refuse(AssetError, r"run the command again", fetch, server, tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []
 
 
@@ -109,8 +109,7 @@ def test_changed_archive_is_refused(server, tmp_path, monkeypatch):
     assert len(recorded[ARCHIVE]) == 64
     (tmp_path / ARCHIVE).unlink()
     server.content = archive({MESH: box_stl((0.1761, 0.092, 0.045))})
-    with pytest.raises(AssetError, match=r"does not match the known hash.*remove"):
-        fetch(server, tmp_path)
+    refuse(AssetError, r"does not match the known hash.*remove", fetch, server, tmp_path)
     assert not (tmp_path / ARCHIVE).exists()
     assert (tmp_path / MESH).is_file()  # the old mesh stays
     assert json.loads((tmp_path / "sha256.json").read_text()) == recorded
@@ -132,8 +131,7 @@ def test_changed_archive_is_refused(server, tmp_path, monkeypatch):
 def test_bad_archives_leave_nothing(server, tmp_path, content, message):
     server.content = content
     folder = tmp_path / "deep" / "ycb"
-    with pytest.raises(AssetError, match=message):
-        fetch(server, folder)
+    refuse(AssetError, message, fetch, server, folder)
     assert list(folder.iterdir()) == []
     assert [path.name for path in tmp_path.iterdir()] == ["deep"]
 
@@ -141,30 +139,26 @@ def test_bad_archives_leave_nothing(server, tmp_path, content, message):
 @pytest.mark.parametrize("package", ["filelock", "pooch", "trimesh", "scipy.spatial"])
 def test_a_missing_package_is_named(server, tmp_path, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingDependencyError, match=f"need the package '{package}'"):
-        fetch(server, tmp_path)
+    refuse(MissingDependencyError, f"need the package '{package}'", fetch, server, tmp_path)
 
 
 @pytest.mark.parametrize("layout", ["{code}.stl", "{code}/google_16k/nontextured.stl"])
 def test_local_folder(tmp_path, monkeypatch, layout):
     monkeypatch.setenv(assets.YCB_DIR_VARIABLE, str(tmp_path))
-    with pytest.raises(MeshError, match=r"004_sugar_box.stl.*DIFFLCS_YCB_DIR"):
-        make_object("sugar_box")
+    refuse(MeshError, r"004_sugar_box.stl.*DIFFLCS_YCB_DIR", make_object, "sugar_box")
     path = tmp_path / layout.format(code=YCB["sugar_box"].code)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(box_stl())
     assert make_object("sugar_box").source == "ycb_mesh"
     path.write_bytes(box_stl((0.3, 0.1, 0.1)))
-    with pytest.raises(MeshError, match="45 x 92 x 176 mm, got 100 x 100 x 300 mm"):
-        make_object("sugar_box")
+    refuse(MeshError, "45 x 92 x 176 mm, got 100 x 100 x 300 mm", make_object, "sugar_box")
 
 
 def test_an_object_that_is_unknown_and_an_address_that_is_no_pattern(tmp_path):
     with pytest.raises(ValueError, match=r"Expected an object out of sugar_box, .*got 'teapot'"):
         assets.download(["teapot"], tmp_path / "new")
     for url in ("http://x/{name}.tgz", "http://x/{}.tgz", "http://x/{code", "{code.x}"):
-        with pytest.raises(ValueError, match=r"Expected an address with \{code\}"):
-            assets.download(["sugar_box"], tmp_path / "new", url)
+        refuse(ValueError, r"Expected an address with \{code\}", assets.download, ["sugar_box"], tmp_path / "new", url)
     assert not (tmp_path / "new").exists()
 
 
@@ -192,8 +186,7 @@ def test_an_address_that_leads_nowhere(server, tmp_path, monkeypatch, url):
 def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
     monkeypatch.setattr(assets, "MAX_UNPACKED", 1 << 20)
     server.content = archive({MESH: box_stl(), "004_sugar_box/zeros": bytes(1 << 21)})
-    with pytest.raises(AssetError, match="at most 1 MB unpacked"):
-        fetch(server, tmp_path)
+    refuse(AssetError, "at most 1 MB unpacked", fetch, server, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -218,19 +211,16 @@ def test_damaged_archives(server, tmp_path):
 )  # fmt: skip
 def test_recorded_hashes_that_are_none(server, tmp_path, content):
     (tmp_path / "sha256.json").write_bytes(content)
-    with pytest.raises(AssetError, match=r"sha256.json: expected recorded checksums.*Delete it"):
-        fetch(server, tmp_path)
+    refuse(AssetError, r"sha256.json: expected recorded checksums.*Delete it", fetch, server, tmp_path)
     assert (tmp_path / "sha256.json").read_bytes() == content
     assert server.requests == 0
 
 
 def test_a_folder_that_cannot_be_written(server, tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(AssetError, match="expected a folder with free space"):
-        fetch(server, tmp_path / "file")
+    refuse(AssetError, "expected a folder with free space", fetch, server, tmp_path / "file")
     (tmp_path / ARCHIVE).mkdir()
-    with pytest.raises(AssetError, match="expected a folder with free space"):
-        fetch(server, tmp_path)
+    refuse(AssetError, "expected a folder with free space", fetch, server, tmp_path)
 
 
 # --- several processes ------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation
 from difflcs_envs.hand.model import FINGERS, LINKS, OBJECTS, PALM_TOP, POSTURE
 from difflcs_envs.hand.task import rotation_to_quaternion
 from difflcs_envs.tasks import hand_cost, hand_system
+from tests.conftest import refuse
 
 ID = "difflcs/HandTurnObject-v0"
 
@@ -97,11 +98,9 @@ def test_rotations_are_those_of_mujoco_and_continue_through_half_a_turn():
 def test_bad_arguments_and_options():
     env, bad = make(), {"object": "cup", "object_mass": 0.0, "friction": -1, "servo_gain": 0, "turn": 4}
     for name, value in {**bad, "render_mode": "human"}.items():
-        with pytest.raises(ValueError, match=r"Expected .*got"):
-            HandTurnObjectEnv(**{name: value})
+        refuse(ValueError, r"Expected .*got", HandTurnObjectEnv, **{name: value})
     for options in ({"goal": [0, 0, 0]}, {"goal": np.zeros(7)}, {"state": np.full(22, 7.0)}, {"yaw": 1.0}, [1]):
-        with pytest.raises(ValueError, match=r"Expected .*got"):
-            env.reset(options=options)
+        refuse(ValueError, r"Expected .*got", env.reset, options=options)
 
 
 def test_the_system_predicts_open_joints_and_the_cost_is_zero_at_the_goal():

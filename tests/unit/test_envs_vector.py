@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 import difflcs_envs
 from difflcs_envs.vector import TriFingerVectorEnv, move_cube
+from tests.conftest import refuse
 
 CUBE, OBJECT, TURN = (f"difflcs/TriFinger{name}-v0" for name in ("MoveCube", "MoveObject", "TurnCube"))
 OBJECT_ARGUMENTS = {"object": "clamp", "object_source": "stand_in"}
@@ -133,16 +134,14 @@ def test_disabled_autoreset_needs_a_mask():
     assert not np.array_equal(observation["state"][1], before["state"][1])
     assert infos["_success"].tolist() == mask.tolist()
     for bad in ([True, True], np.zeros(3, bool), np.ones(3)):
-        with pytest.raises(ValueError, match="reset_mask"):
-            envs.reset(options={"reset_mask": bad})
+        refuse(ValueError, "reset_mask", envs.reset, options={"reset_mask": bad})
 
 
 def test_goal_and_state_options_reach_every_environment():
     envs = move_cube(2)
     goal = [0.01, -0.02, 0.3]
     np.testing.assert_allclose(envs.reset(seed=0, options={"goal": goal})[0]["goal"], [goal, goal])
-    with pytest.raises(ValueError, match="task space"):
-        envs.reset(options={"goal": [1, 0, 0]})
+    refuse(ValueError, "task space", envs.reset, options={"goal": [1, 0, 0]})
 
 
 def test_instability_stays_in_its_lane(tmp_path, monkeypatch):
@@ -174,26 +173,22 @@ def test_copies_continue_alike():
 
 @pytest.mark.parametrize("arguments", [{"num_envs": 0}, {"num_envs": 2.5}, {"num_envs": 2, "threads": 0}])
 def test_bad_arguments(arguments):
-    with pytest.raises(ValueError, match=r"Expected .*got"):
-        move_cube(**arguments)
+    refuse(ValueError, r"Expected .*got", move_cube, **arguments)
 
 
 @pytest.mark.parametrize("actions", [np.zeros(6), np.zeros((3, 6)), np.full((2, 6), np.nan), "push"])
 def test_bad_actions(actions):
     envs = move_cube(2)
     envs.reset(seed=0)
-    with pytest.raises(ValueError, match=r"Expected actions = .*got"):
-        envs.step(actions)
-    with pytest.raises(ValueError, match="2 seeds"):
-        envs.reset(seed=[1, 2, 3])
+    refuse(ValueError, r"Expected actions = .*got", envs.step, actions)
+    refuse(ValueError, "2 seeds", envs.reset, seed=[1, 2, 3])
 
 
 def test_torchrl_that_is_missing_is_named(monkeypatch):
     from difflcs_envs.torchrl import make_env
 
     monkeypatch.setitem(sys.modules, "torchrl.envs", None)
-    with pytest.raises(difflcs_envs.MissingDependencyError, match="torchrl"):
-        make_env("cube")
+    refuse(difflcs_envs.MissingDependencyError, "torchrl", make_env, "cube")
 
 
 @pytest.mark.parametrize(("task", "arguments"), [("cube", {}), ("clamp", {"object_source": "stand_in"}), (TURN, {})])

@@ -11,6 +11,7 @@ import torch
 from difflcs import GoalCost, LCSMPCLayer, Status
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoLCS
+from tests.conftest import refuse
 
 SECONDS = (0.002, 0.02, 0.1)
 FIRM = '<option timestep=".001" cone="elliptic" impratio="100"/>'  # friction that hardly creeps; by default it does
@@ -161,8 +162,7 @@ def test_free_motion_is_as_right_as_differences_of_the_simulation(name, option):
 
 def test_a_nominal_control_is_checked():
     model = load(FREE, ACTUATORS["motors"])
-    with pytest.raises(InvalidInputError, match="ctrl"):
-        MujocoLCS(model, motion="dynamic", ctrl=[0.0])
+    refuse(InvalidInputError, "ctrl", MujocoLCS, model, motion="dynamic", ctrl=[0.0])
     module = MujocoLCS(model, motion="dynamic", ctrl=[0.1, 0.2])
     torch.testing.assert_close(
         module.params(torch.zeros(4).double()).A,

@@ -11,6 +11,7 @@ from difflcs.rl import Adam, Natural
 from difflcs.rl.learning.optim import AdamUpdate, NaturalUpdate, StepSize
 from difflcs.rl.learning.optim.update import Deviation
 from difflcs.rl.learning.policy import make_actor
+from tests.conftest import refuse
 from tests.training.slide import drawn, make_model, make_mpc, same
 
 STD = 0.03
@@ -162,6 +163,5 @@ def test_a_loaded_rule_goes_on_the_same(kind, covariance):
 def test_a_step_size_that_is_not_positive_is_refused(size):
     _, rule = make("adam")
     state = rule.state_dict()
-    with pytest.raises(CheckpointError, match="positive step size"):
-        rule.load_state_dict({**state, "step_size": size})
+    refuse(CheckpointError, "positive step size", rule.load_state_dict, {**state, "step_size": size})
     assert rule.size.value == ADAM.learning_rate
