@@ -113,12 +113,6 @@ class Build:
     def cost(seed: int = 0, **sizes) -> QuadraticCost:
         return QuadraticCost(**Build.cost_tensors(seed, **sizes))
 
-    @staticmethod
-    def paper_cost(dtype=torch.float64) -> GoalCost:
-        """Eq. 13: nine states (cube x, y, yaw; three fingertips), six actions."""
-        pairs = [(3, 0), (4, 1), (5, 0), (6, 1), (7, 0), (8, 1)]
-        return GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, pairs, 10.0, 6.0, dtype=dtype)
-
     class AskedCost:
         """A `GoalCost` that is asked as a `CostModule`."""
 
@@ -129,24 +123,6 @@ class Build:
             assert goal is not None
             end, one = self.cost(goal, horizon=0), self.cost(goal, horizon=1)
             return QuadraticCost(**end.tensors(), constant_stage=one.constant - end.constant)
-
-    @staticmethod
-    def pushing(seed: int = 0, n_lam: int = 5) -> LCSParams:
-        """A synthetic pushing model of the paper's size."""
-        n = Build.normal(seed)
-        G, H = 0.5 * n(n_lam, n_lam), 0.3 * n(n_lam, n_lam)
-        B = 0.05 * n(9, 6)
-        B[3:] += torch.eye(6, dtype=torch.float64)
-        return LCSParams(
-            A=torch.eye(9, dtype=torch.float64) + 0.02 * n(9, 9),
-            B=B,
-            C=0.3 * n(9, n_lam),
-            d=0.001 * n(9),
-            D=n(n_lam, 9),
-            E=2 * n(n_lam, 6),
-            F=G @ G.mT + 0.3 * torch.eye(n_lam, dtype=torch.float64) + H - H.mT,
-            c=0.02 * n(n_lam),
-        )
 
 
 @pytest.fixture(scope="session")

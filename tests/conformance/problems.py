@@ -20,6 +20,8 @@ from difflcs import (
     StageBounds,
     solve_lcp,
 )
+from difflcs.cli.bench import pushing_model
+from difflcs.systems import pushing_cost
 from tests.conformance import judges
 from tests.conformance.cases import in_units, rank
 from tests.conformance.judges import affine, mul
@@ -195,11 +197,11 @@ def without_contact(build):
 
 
 def paper_sized(build):
-    cost = build.paper_cost()(0.05 * build.normal(4)(6, 3), horizon=5)
+    cost = pushing_cost()(0.05 * build.normal(4)(6, 3), horizon=5)
     limit = torch.full((6,), 0.015, dtype=torch.float64)
     weights = {k: v.detach() for k, v in cost.fields().items()}
     bounds = {"u_min": -limit, "u_max": limit}
-    tensors = {**build.pushing().tensors(), **weights, **bounds, "x0": 0.05 * build.normal(3)(6, 9)}
+    tensors = {**pushing_model(5, 0).tensors(), **weights, **bounds, "x0": 0.05 * build.normal(3)(6, 9)}
     return Problem(tensors, horizon=5, relaxation=1e-5)
 
 

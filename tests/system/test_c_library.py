@@ -23,6 +23,7 @@ from difflcs.mpc.export import export_controller
 from difflcs.physics import BodyFrameLCS
 from difflcs.rl import TrainedPolicy
 from difflcs.rl.tasks import get_task, single_start_backend
+from difflcs.systems import pushing_cost
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("cmake", "cc", "c++")
@@ -151,7 +152,7 @@ def test_a_hand_is_linearised_anew_before_each_step(project, tmp_path):
 @needs_tools
 def test_what_the_header_promises(exported, project, build, tmp_path):
     folder, searching = project("tests/native/c"), BatchedBackend(effort="best")
-    mpc = LCSMPCLayer(LCSModel.from_pretrained(MODEL), build.paper_cost(), 8, -0.015, 0.015, backend=searching)
+    mpc = LCSMPCLayer(LCSModel.from_pretrained(MODEL), pushing_cost(), 8, -0.015, 0.015, backend=searching)
     mpc.controller().save(tmp_path / "best.difflcs")
     for kind, file in (("difflcs", exported / "controller.difflcs"), ("difflcs_static", tmp_path / "best.difflcs")):
         assert call(folder / f"contract_{kind}", file) == "all holds\n"

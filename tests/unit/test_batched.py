@@ -14,14 +14,15 @@ import torch
 from benchmarks.models import chain_of_carts, push_the_last_cart
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs._native import _kernels
+from difflcs.cli.bench import pushing_model
 from difflcs.errors import SolveWarning
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.systems import cart_pole_between_walls
+from difflcs.systems import cart_pole_between_walls, pushing_cost
 
 
 def pushing(build, n_lam, system=0, lcs=None, on_failure="raise", **options):
-    lcs, backend = build.pushing(system, n_lam) if lcs is None else lcs, BatchedBackend(**options)
-    return LCSMPCLayer(lcs, build.paper_cost(), 5, -0.015, 0.015, backend=backend, on_failure=on_failure)
+    lcs, backend = pushing_model(n_lam, system) if lcs is None else lcs, BatchedBackend(**options)
+    return LCSMPCLayer(lcs, pushing_cost(), 5, -0.015, 0.015, backend=backend, on_failure=on_failure)
 
 
 def data(build, count, seed=1):
@@ -56,7 +57,7 @@ def test_what_a_thread_keeps_of_a_problem_serves_no_other(build, n_lam):
 
 
 def test_threads_change_nothing_not_even_summed_gradients(build):
-    model = LCSModel.from_params(build.pushing(0, 5))
+    model = LCSModel.from_params(pushing_model(5, 0))
     x0, goal = data(build, 100)
     found = []
     for threads in (1, 2, 5):
@@ -184,7 +185,7 @@ def test_a_contact_that_is_far_is_found(limit, effort):
 
 @pytest.mark.parametrize("effort", ["fast", "default"])
 def test_plans_for_almost_hard_contact_cost_less_where_contact_is_hard(build, effort):
-    lcs, call = build.pushing(0, 5), data(build, 32)
+    lcs, call = pushing_model(5, 1), data(build, 32)
     mpc = pushing(build, 5, lcs=lcs, effort=effort)
 
     def executed(relaxation):
@@ -218,7 +219,7 @@ def test_nearly_every_problem_is_solved(build, kind):
     solved = 0
     for n_lam in (5, 8):
         if kind == "pushing":
-            lcs = build.pushing(1, n_lam)
+            lcs = pushing_model(n_lam, 1)
         else:
             lcs = LCSModel(9, 6, n_lam, init_scale=0.3 if kind == "random" else 1e-3, generator=generator)
         with torch.no_grad():

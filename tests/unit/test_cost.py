@@ -8,6 +8,7 @@ from torch import nn
 
 from difflcs import CostSequence, QuadraticCost
 from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.systems import pushing_cost
 from tests.conformance import judges
 from tests.conftest import refuse
 
@@ -44,11 +45,11 @@ def paper(x, u, goal):
 def test_reach_is_the_cost_of_the_paper_with_its_constant(build, seed):
     n = build.normal(seed)
     x, u, goal = n(6, 9), n(5, 6), n(3)
-    assert evaluate(build.paper_cost()(goal, horizon=5), x, u) == pytest.approx(paper(x, u, goal), rel=1e-12)
+    assert evaluate(pushing_cost()(goal, horizon=5), x, u) == pytest.approx(paper(x, u, goal), rel=1e-12)
 
 
 def test_goals_of_any_batch_shape(build):
-    cost, goal = build.paper_cost(), build.normal(0)(2, 5, 3)
+    cost, goal = pushing_cost(), build.normal(0)(2, 5, 3)
     mapped = cost(goal, horizon=4)
     assert mapped.q.shape == mapped.q_final.shape == (2, 5, 9)
     assert mapped.constant.shape == (2, 5)
@@ -123,7 +124,7 @@ def test_semidefinite_weights_with_cross_terms_are_accepted():
 
 
 def test_following_a_reference_is_tracking_each_goal(build):
-    cost, n = build.paper_cost(), build.normal(4)
+    cost, n = pushing_cost(), build.normal(4)
     x, u, reference = n(6, 9), n(5, 6), n(2, 6, 3)
     followed = cost.follow(reference)
     assert isinstance(followed, CostSequence)
@@ -140,4 +141,4 @@ def test_following_a_reference_is_tracking_each_goal(build):
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (6, 2)])
 def test_references_of_other_shapes_are_refused(build, shape):
     with pytest.raises(ShapeError, match=r"reference: expected .*n_goal=3"):
-        build.paper_cost().follow(torch.zeros(shape, dtype=torch.float64))
+        pushing_cost().follow(torch.zeros(shape, dtype=torch.float64))

@@ -10,7 +10,9 @@ from torch.func import grad, jvp, vmap
 
 from difflcs import LCSMPCLayer, LCSParams, Status
 from difflcs import errors as e
+from difflcs.cli.bench import pushing_model
 from difflcs.mpc import Primal
+from difflcs.systems import pushing_cost
 from tests.conftest import refuse
 
 
@@ -60,7 +62,7 @@ def test_vmap_over_guesses_bounds_and_goals(build, layer, x0):
     warm = vmap(lambda x, *g: layer(x, guess=Primal(*g)).iterations)(x0, sol.x, sol.u, sol.lam)
     assert torch.equal(warm, layer(x0, guess=sol).iterations)
     assert int(warm.sum()) < int(sol.iterations.sum())
-    pusher = LCSMPCLayer(build.pushing(), build.paper_cost(), 2, -0.015, 0.015, relaxation=1e-4)
+    pusher = LCSMPCLayer(pushing_model(5, 0), pushing_cost(), 2, -0.015, 0.015, relaxation=1e-4)
     n = build.normal(2)
     x, goal, reference = 0.05 * n(3, 9), 0.05 * n(4, 3), 0.05 * n(4, 3, 3)
     close(vmap(lambda g: pusher(x, g).u)(goal), pusher(x, goal[:, None]).u)

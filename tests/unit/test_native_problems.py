@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
+from difflcs.cli.bench import pushing_model
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
@@ -22,7 +23,7 @@ every_solver = pytest.mark.parametrize("solver", [BATCHED, IpoptBackend(workers=
 
 def pushing(build, n_lam, count, shared=True, barrier=0.0):
     cost = GoalCost.reach(9, 6, goal_weight=[1.0, 1.0, 0.1], input_weight=10.0, pairs=[(3, 0), (4, 1)], pair_weight=0.1)
-    lcs, n = build.pushing(0, n_lam), build.normal(1)
+    lcs, n = pushing_model(n_lam, 0), build.normal(1)
     if not shared:
         lcs = LCSParams(**{k: v * (1 + 0.01 * n(count, *[1] * v.ndim)) for k, v in lcs.tensors().items()})
     mpc = LCSMPCLayer(lcs, cost, 5, -0.015, 0.015, backend=BATCHED, barrier=barrier)
