@@ -1,7 +1,5 @@
 """Linear complementarity systems from known physics: shapes in the plane, MuJoCo models, and learnable physics."""
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

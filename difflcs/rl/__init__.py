@@ -1,7 +1,5 @@
 """Training and evaluation of LCS-MPC policies; needs the extra `rl`."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from difflcs._optional import require

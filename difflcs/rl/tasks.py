@@ -4,17 +4,18 @@ A package publishes its tasks without being imported first by an entry point of 
 without arguments that registers them: docs/own_system.md makes one.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import gymnasium
 import torch
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from difflcs._checks import check_kind, check_number, check_positive_int, check_tensor, did_you_mean, make_plain
@@ -24,10 +25,6 @@ from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
 from difflcs.records import LCSModule
-
-if TYPE_CHECKING:
-    import gymnasium
-    from gymnasium.vector import VectorEnv
 
 ENTRY_POINTS = "difflcs.tasks"
 """Group of entry points that register tasks."""
@@ -281,8 +278,6 @@ class TaskSpec:
             InvalidInputError: it cannot be made.
         """
         with self._making() as arguments:
-            import gymnasium
-
             make = functools.partial(gymnasium.make, self.env) if isinstance(self.env, str) else self.env
             return make(**arguments, **kwargs)
 
@@ -298,8 +293,6 @@ class TaskSpec:
             InvalidInputError: they cannot be made, or would clip actions within the bounds of the task.
         """
         with self._making() as arguments:
-            import gymnasium
-
             if not isinstance(self.env, str):
                 envs: VectorEnv = gymnasium.vector.SyncVectorEnv([functools.partial(self.env, **arguments)] * count)
             else:
@@ -318,8 +311,6 @@ class TaskSpec:
         except InvalidInputError:
             envs.close()
             raise
-        from gymnasium.vector.utils import batch_space
-
         envs.single_action_space, envs.action_space = space, batch_space(space, envs.num_envs)
         return envs
 

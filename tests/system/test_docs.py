@@ -15,8 +15,12 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+import objects
 import pytest
 
+from difflcs import cli
+from difflcs.cli import commands
+from difflcs.cli.train import Train
 from tests.system.forks import run_code
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -135,9 +139,6 @@ def test_code_fits_the_page():
 @pytest.fixture
 def parse(monkeypatch):
     """What the command line says against words after `difflcs`, and nothing that it would do."""
-    from difflcs import cli
-    from difflcs.cli import commands
-
     for kind in vars(commands).values():
         if isinstance(kind, type) and callable(getattr(kind, "run", None)):
             monkeypatch.setattr(kind, "run", lambda command: 0)
@@ -183,12 +184,6 @@ def test_the_commands_of_a_page_exist(page, parse):
 
 
 def test_the_quick_settings_are_those_that_were_measured(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import objects
-
-    from difflcs import cli
-    from difflcs.cli.train import Train
-
     asked = []
     monkeypatch.setattr(Train, "run", lambda command: asked.append(command))
     page = [code.replace("\\\n", " ") for code in blocks(DOCS / "training.md", "bash")]

@@ -1,10 +1,15 @@
 """The examples, on few episodes; that of Judo's cylinder_push on a model like Judo's."""
 
-from pathlib import Path
-
+import box_to_pose
+import cylinder_push
+import hand_turn
+import mixture as m
 import numpy as np
+import pusher
 import pytest
+import terminal_value as t
 import torch
+import trifinger_context
 
 from difflcs import LCSModel
 from difflcs.rl import TrainConfig, train
@@ -19,22 +24,13 @@ MODEL = f"""<mujoco><option timestep=".02"/><worldbody>{BODY.format("pusher")}{B
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(autouse=True)
-def _examples(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
-
-
 def test_the_cylinder_comes_to_the_origin(capsys, tmp_path):
-    import cylinder_push
-
     (tmp_path / "model.xml").write_text(MODEL)
     cylinder_push.main(cylinder_push.Options(tmp_path / "model.xml", episodes=1, seed=100))
     assert float(capsys.readouterr().out.split("worst ")[1].split(" cm")[0]) < 3
 
 
 def test_a_box_is_pushed_to_poses_from_the_wrong_side():
-    import box_to_pose
-
     policy, module = box_to_pose.make_policy()
     episodes = [box_to_pose.play(2000 + k, policy, module) for k in range(10)]
     assert sum(episode.success for episode in episodes) >= 9
@@ -43,16 +39,12 @@ def test_a_box_is_pushed_to_poses_from_the_wrong_side():
 
 
 def test_a_cylinder_is_turned_in_a_hand_and_filmed(capsys, tmp_path):
-    import hand_turn
-
     hand_turn.main(hand_turn.Options("cylinder", episodes=2, seed=100, out=tmp_path / "hand.gif"))
     assert "all 2/2" in capsys.readouterr().out
     assert (tmp_path / "hand.gif").stat().st_size > 10_000
 
 
 def test_three_fingers_find_out_how_large_the_cube_is(capsys):
-    import trifinger_context
-
     reached = []
     for adapt in (False, True):
         trifinger_context.main(trifinger_context.Options(side=3.0, adapt=adapt, goals=24, seed=100))
@@ -62,8 +54,6 @@ def test_three_fingers_find_out_how_large_the_cube_is(capsys):
 
 
 def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
-    import pusher
-
     monkeypatch.setattr(pusher, "STEPS", 25)
     means = []
     for still in (False, True):
@@ -73,8 +63,6 @@ def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
 
 
 def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
-    import terminal_value as t
-
     state, goal = (0.1 * torch.randn(400, n, dtype=torch.float64) for n in (9, 3))
     features, cost = t.pushing_features(), t.get_task("cube").make_cost()
     wanted = [torch.tensor([[3.0, -1.0], [-1.0, 2.0]]).double(), torch.tensor([[0.5]]).double()]
@@ -88,8 +76,6 @@ def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
 
 
 def test_a_value_is_fitted_after_the_warmup_and_moves_with_the_lcs(tmp_path):
-    import terminal_value as t
-
     values = []
     for move in (False, True):
         method = t.ValueMethod(n_lam=3, move=move).smoke()
@@ -105,8 +91,6 @@ def test_a_value_is_fitted_after_the_warmup_and_moves_with_the_lcs(tmp_path):
 
 
 def test_a_mixture_is_learned_and_averages_its_systems(tmp_path):
-    import mixture as m
-
     lcs = m.MixtureLCS.from_pretrained(_train_briefly(m.MixtureMethod(n_lam=3).smoke(), tmp_path))
     x, systems = torch.randn(4, 9, dtype=torch.float64), []
     for k in range(m.COMPONENTS):

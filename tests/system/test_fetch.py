@@ -1,16 +1,13 @@
 """The scoreboard of gymnasium-robotics' Fetch tasks, on what needs no third-party model."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
+import fetch_policies as fetch
 import numpy as np
 import pytest
 
 
-def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
-    import fetch_policies as fetch
-
+def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it():
     geoms = SimpleNamespace(friction=np.array([0.1])), SimpleNamespace(friction=np.array([0.05]))
     model = SimpleNamespace(
         eq_solref=np.array([[0.02, 1.0]]),

@@ -3,40 +3,24 @@
 import importlib.util
 import json
 import math
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import push_t
+import pusht as board
 import pytest
 import torch
 
 from difflcs.physics import PDDrive
 
-ROOT = Path(__file__).resolve().parents[2]
 KEYS = {"success_rate", "ci_low", "ci_high", "episodes", "mean_steps", "milliseconds_per_step", "coverage"}
-
-
-@pytest.fixture
-def push_t(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "examples"))
-    import push_t
-
-    return push_t
-
-
-@pytest.fixture
-def board(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "scoreboard"))
-    import pusht
-
-    return pusht
 
 
 def line_of(capsys):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def test_a_step_of_the_disc_is_predicted_as_the_environment_makes_it_and_tells_scale_and_friction(push_t):
+def test_a_step_of_the_disc_is_predicted_as_the_environment_makes_it_and_tells_scale_and_friction():
     hypotheses = [[0.8, 0.0], [1.0, 0.0], [1.0, 0.5], [1.25, 0.0]]
     predict = push_t.DiscContact(push_t.tee_pushing())
     seen = push_t.ContextFilter(predict, hypotheses, 0.01, hopeless=10.0, angles=(2,))
@@ -58,7 +42,7 @@ def test_a_step_of_the_disc_is_predicted_as_the_environment_makes_it_and_tells_s
 
 
 @pytest.mark.slow  # plays
-def test_predictions_are_those_of_pymunk(push_t, board):
+def test_predictions_are_those_of_pymunk():
     env, policy, errors = push_t.make_env(), push_t.PushTPolicy(), []
     observation, _ = env.reset(seed=1000)
     for shape in env.unwrapped.agent.shapes | env.unwrapped.block.shapes:
@@ -81,7 +65,7 @@ def test_predictions_are_those_of_pymunk(push_t, board):
 
 
 @pytest.mark.slow  # plays
-def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, tmp_path, monkeypatch):
+def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(capsys, tmp_path, monkeypatch):
     out = tmp_path / "pusht.json"
 
     def play(**options):
@@ -91,7 +75,7 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, 
     first = line_of(capsys)
     assert set(first) >= KEYS
     assert (first["episodes"], first["mean_steps"], first["variant"]) == (1, 5, "noise 2 px")
-    monkeypatch.setattr(board, "play", None)
+    monkeypatch.setattr("play", None)
     play()  # from the record
     assert line_of(capsys) == first
     with pytest.raises(ValueError, match="name another file"):
@@ -100,7 +84,7 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, 
 
 @pytest.mark.skipif(importlib.util.find_spec("gym_pushany") is None, reason="needs gym-pushany: pip install it")
 @pytest.mark.slow  # plays
-def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(push_t, board, capsys):
+def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(capsys):
     import push_any
     import pushany
 
@@ -120,13 +104,13 @@ def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_
         assert env.within_reach is reached
 
 
-def test_a_variant_that_is_none_is_refused(board):
+def test_a_variant_that_is_none_is_refused():
     with pytest.raises(ValueError, match="outline -20 %"):
         board.main(board.Options(variant="wrong"))
 
 
 @pytest.mark.slow  # plays and learns
-def test_random_pushing_teaches_the_radius_of_gyration(board):
+def test_random_pushing_teaches_the_radius_of_gyration():
     found = board.learn(board.make_env(), seed=0, steps=300, iterations=60)
     before, after = (values["gyration"] for values in found.values)
     assert abs(after - board.GYRATION) < 0.3 * abs(before - board.GYRATION)
@@ -134,7 +118,7 @@ def test_random_pushing_teaches_the_radius_of_gyration(board):
 
 
 @pytest.mark.slow  # plays an episode
-def test_the_film_is_a_gif(push_t, capsys, tmp_path):
+def test_the_film_is_a_gif(capsys, tmp_path):
     from PIL import Image
 
     film = tmp_path / "push_t.gif"
@@ -145,7 +129,7 @@ def test_the_film_is_a_gif(push_t, capsys, tmp_path):
         assert picture.info["duration"] == 100
 
 
-def test_the_tee_is_that_of_the_environment(push_t):
+def test_the_tee_is_that_of_the_environment():
     system = push_t.tee_pushing()
     # Moments that pymunk gives: twice that of a bar of 120 × 30 about the middle of its upper edge, for a mass of 1.
     bar = (120**2 + 30**2) / 12 + 15**2
@@ -161,7 +145,7 @@ def test_the_tee_is_that_of_the_environment(push_t):
     assert turned == pytest.approx([1.0 - middle, 2.0, math.pi / 2])
 
 
-def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane(push_t):
+def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane():
     policy = push_t.PushTPolicy()
     target = policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
     assert target.shape == (2,)
@@ -169,14 +153,14 @@ def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane(push_t):
     assert policy.sampling.decision.mode == "travel"
 
 
-def test_a_picture_shows_what_was_decided(push_t):
+def test_a_picture_shows_what_was_decided():
     env, policy = SimpleNamespace(render=lambda: np.zeros((96, 96, 3), np.uint8)), push_t.PushTPolicy()
     plain = push_t.picture(env, policy)
     policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
     assert push_t.picture(env, policy) != plain
 
 
-def test_actions_that_come_late_are_planned_from_where_things_will_be(push_t):
+def test_actions_that_come_late_are_planned_from_where_things_will_be():
     late, seen = push_t.PushTPolicy(delay=1), [400.0, 400.0, 256.0, 256.0, 0.0]
     sent = late.act(seen)
     torch.testing.assert_close(

@@ -2,35 +2,30 @@
 
 import dataclasses
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
+import race
+import race_hard
+import race_loops
+import race_problems
 import torch
+from models import pushing_model
+from race_global import hard_cost
+from race_problems import cart_pole
+from rivals import admm, sampling
+from rivals.problem import Condensed, sparse_program
 from scipy.optimize import nnls
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 COUNT = 5
 
 
 @pytest.fixture
-def race(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import race
-
-    return race
+def pushing():
+    return race_problems.pushing(pushing_model(5, 0), count=COUNT, seed=0)
 
 
-@pytest.fixture
-def pushing(race):
-    from models import pushing_model
-    from race_problems import pushing
-
-    return pushing(pushing_model(5, 0), count=COUNT, seed=0)
-
-
-def test_a_rival_that_is_not_there_is_reported(race, tmp_path):
+def test_a_rival_that_is_not_there_is_reported(tmp_path):
     absent = race.Process(race.Entry("absent", "layer", venv="nowhere"), tmp_path, str(tmp_path))
     assert "--install" in absent.missing
     broken = race.Process(race.Entry("broken", "no_such_rival"), tmp_path, str(tmp_path))
@@ -38,9 +33,7 @@ def test_a_rival_that_is_not_there_is_reported(race, tmp_path):
     broken.close()
 
 
-def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(race, tmp_path):
-    from race_problems import cart_pole
-
+def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(tmp_path):
     problem = cart_pole(COUNT, horizon=10, seed=0)
     process = race.Process(race.CONTACT[2], tmp_path, str(tmp_path))
     assert not process.missing
@@ -61,9 +54,7 @@ def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(race, tmp_pat
     assert float(np.nanmin(race.judge(problem, u, said, wrong).gradient_error)) > 0.1
 
 
-def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
-    from rivals.problem import Condensed, sparse_program
-
+def test_both_quadratic_programs_are_the_linear_mpc(pushing):
     none = {"C": pushing.C[:, :0], "D": pushing.D[:0], "E": pushing.E[:0], "F": pushing.F[:0, :0], "c": pushing.c[:0]}
     wide = {"u_min": np.full(6, -9.0), "u_max": np.full(6, 9.0), "q": pushing.q[0], "q_final": pushing.q_final[0]}
     linear = dataclasses.replace(pushing, **none, **wide)
@@ -79,9 +70,7 @@ def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
     np.testing.assert_allclose(found.primal.u[1].flatten(), z, rtol=0, atol=1e-7)
 
 
-def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
-    from race_global import hard_cost
-
+def test_hard_cost_is_that_of_the_exact_contact(pushing):
     mpc = race.as_mpc(pushing)
     u = mpc.clip(0.01 * torch.ones(COUNT, mpc.horizon, mpc.n_u, dtype=torch.float64))
     sharp = dataclasses.replace(mpc, relaxation=1e-12)
@@ -89,11 +78,7 @@ def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
     assert float((hard_cost(mpc, u) - mpc.objective(mpc.rollout(u)[0], u)).abs().max()) > 0
 
 
-def test_planners_for_contact_come_near_the_best_plan(race):
-    import race_hard
-    from race_problems import cart_pole
-    from rivals.sampling import Solver
-
+def test_planners_for_contact_come_near_the_best_plan():
     problem = cart_pole(2, horizon=10, seed=0)
     tuned = race_hard.json.loads(race_hard.TUNED.read_text())["cart-pole, H 10"]
     best = race_hard.reference(problem)
@@ -102,14 +87,12 @@ def test_planners_for_contact_come_near_the_best_plan(race):
             solver = race_hard.MODULES[row["module"]].Solver(problem, **row["settings"])
             u = np.concatenate([solver.one(i).u for i in range(2)])
             assert (race_hard.objectives(problem, u) < (1.2 if "3 iter" in label else 1.02) * best).all(), label
-    costs = [Solver(problem).costs(problem.only(i), u[i : i + 1])[0] for i in range(2)]
+    costs = [sampling.Solver(problem).costs(problem.only(i), u[i : i + 1])[0] for i in range(2)]
     np.testing.assert_allclose(costs + problem.constant, race_hard.objectives(problem, u), rtol=1e-9)
 
 
-def test_c3_projects_onto_the_nearest_point_that_complementarity_allows(race, pushing):
-    from rivals.admm import Solver
-
-    solver = Solver(pushing, iterations=1, weight=1.0, gap=0.5, project="exact", new=True)
+def test_c3_projects_onto_the_nearest_point_that_complementarity_allows(pushing):
+    solver = admm.Solver(pushing, iterations=1, weight=1.0, gap=0.5, project="exact", new=True)
     M, inverses = solver.supports(pushing.F)
     size = pushing.n_lam
     for target in np.random.default_rng(0).standard_normal((20, 2 * size)):
@@ -121,9 +104,7 @@ def test_c3_projects_onto_the_nearest_point_that_complementarity_allows(race, pu
         assert nearest == pytest.approx(min(nnls(mode, target)[1] for mode in modes), rel=1e-9)
 
 
-def test_a_rival_closes_the_loop_in_mujoco_and_samples_in_a_copy_of_it(race):
-    import race_loops
-
+def test_a_rival_closes_the_loop_in_mujoco_and_samples_in_a_copy_of_it():
     loop = race_loops.Cube()
     tuned = race_loops.json.loads(race_loops.TUNED.read_text())["cube"]["C3, 10 iterations"]
     found = race_loops.play(loop, tuned["module"], tuned["settings"], range(2000, 2003), 100.0)

@@ -1,21 +1,16 @@
 """The policy of `benchmarks/scoreboard/trifinger_push`: its geometry here, and the simulator where it is installed."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trifinger_rl
+from trifinger_push.cube import HALF, TIP_RADIUS, UNIT, CubeEstimator, planar_pose
+from trifinger_push.fingers import inverse
+from trifinger_push.places import OVER, FingerPlaces, FingerTravel, OneFinger
 
 from difflcs.errors import MissingDependencyError
-
-SCOREBOARD = Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"
-
-
-@pytest.fixture(autouse=True)
-def scoreboard(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCOREBOARD))
-
 
 # Places of the tips at joint angles (0, 0.9, -1.7) of every finger, by Pinocchio from trifingerpro.urdf.
 START = np.array([[0.086, 0.06106], [0.00988, -0.10501], [-0.09588, 0.04395]])
@@ -41,15 +36,11 @@ def camera(pose, age):
 
 
 def state(pose, tip, finger):
-    from trifinger_push.cube import UNIT
-
     return torch.tensor([pose[0] / UNIT, pose[1] / UNIT, pose[2], *(np.asarray(tip) / UNIT), finger])
 
 
 @pytest.mark.parametrize("finger", [0, 1, 2])
 def test_inverse_kinematics_knows_the_start_posture(finger):
-    from trifinger_push.fingers import inverse
-
     angles, knee = inverse(finger, np.array([[*START[finger], START_HEIGHT]]))
     np.testing.assert_allclose(angles, [[0.0, 0.9, -1.7]], atol=2e-4)
     # The first link hangs 0.9 rad out of the vertical.
@@ -58,8 +49,6 @@ def test_inverse_kinematics_knows_the_start_posture(finger):
 
 @pytest.mark.parametrize("face", [([1, 0, 0], 0), ([1, 0, 0], 1), ([1, 0, 0], 2), ([1, 0, 0], 3), ([0, 1, 0], 1)])
 def test_yaw_of_a_cube_on_any_face(face):
-    from trifinger_push.cube import planar_pose
-
     axis, quarters = face
     lying = product(quaternion([0, 0, 1], 0.3), quaternion(axis, quarters * np.pi / 2))
     pose = planar_pose(np.array([0.1, -0.05, 0.0325]), lying)
@@ -68,8 +57,6 @@ def test_yaw_of_a_cube_on_any_face(face):
 
 
 def test_the_cube_has_moved_since_its_picture():
-    from trifinger_push.cube import HALF, TIP_RADIUS, CubeEstimator
-
     estimator = CubeEstimator(friction=0.5)
     tips = np.array([[-HALF - TIP_RADIUS, 0.0, 0.02], [0.1, 0.1, 0.1], [0.1, -0.1, 0.1]])
     ages = [0.09, 0.11, 0.13, 0.15, 0.17]
@@ -88,8 +75,6 @@ def test_the_cube_has_moved_since_its_picture():
 
 
 def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
-    from trifinger_push.places import OneFinger
-
     model = OneFinger(friction=0.3, compliance=0.05)
     x = state([0.01, 0.02, 0.3], [-0.04, 0.02, 0.022], 2.0)
     u = torch.tensor([0.2, 0.05, -0.1])
@@ -101,9 +86,6 @@ def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
 
 
 def test_a_face_that_was_refused_is_not_offered_until_later():
-    from trifinger_push.cube import UNIT
-    from trifinger_push.places import FingerPlaces
-
     places, x = FingerPlaces(), state([0.0, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
     before = places.sample(x)
     face = before[before[:, 0] == 0][0]
@@ -118,9 +100,6 @@ def test_a_face_that_was_refused_is_not_offered_until_later():
 
 
 def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
-    from trifinger_push.cube import UNIT
-    from trifinger_push.places import OVER, FingerTravel
-
     travel, pose = FingerTravel(), [0.0, 0.0, 0.0]
     target = state(pose, [-0.055, 0.0, 0.022], 0.0)
     travel.tips = np.array([[-0.09, 0.02, 0.1]] * 3)
@@ -144,8 +123,6 @@ def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
 
 
 def test_the_package_that_is_missing_is_named(monkeypatch):
-    import trifinger_rl
-
     monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)
     with pytest.raises(MissingDependencyError, match=r"pip install trifinger-rl-datasets==1\.0\.3"):
         trifinger_rl.main(trifinger_rl.Options(policy="contact-mpc"))

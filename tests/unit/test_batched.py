@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from models import chain_of_carts, push_the_last_cart
 
-from benchmarks.models import chain_of_carts, push_the_last_cart
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs._native import _kernels
 from difflcs.cli.bench import pushing_model

@@ -1,17 +1,13 @@
 """Checks that a module can be trained: a `torch.nn.Module` with parameters that require gradients."""
 
-from __future__ import annotations
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
-
+from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from difflcs._checks import describe
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
 
 
 def check_module(lcs: object, env: VectorEnv | None = None, name: str = "lcs") -> nn.Module:

@@ -1,19 +1,15 @@
 """LCS-RL: the warm-up phase (Algorithm 1), then the main phase (Algorithm 2) from its model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from difflcs._checks import check_choice, check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitReport
+from difflcs.rl.learning.ppo import PPO, PPOReport
 from difflcs.rl.learning.state_tree import State
 from difflcs.rl.learning.trainer import AfterStep, Trainer
-
-if TYPE_CHECKING:
-    from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitReport
-    from difflcs.rl.learning.ppo import PPO, PPOReport
-    from difflcs.rl.learning.warmup import Warmup, WarmupReport
+from difflcs.rl.learning.warmup import Warmup, WarmupReport
 
 _WARMUP, _MAIN = "warmup", "main"
 

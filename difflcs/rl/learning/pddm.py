@@ -5,14 +5,13 @@ them by their rewards acts through it. The planner's objective is that of the LC
 model and in the search.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from difflcs._checks import check_positive_int
@@ -32,9 +31,6 @@ from difflcs.rl.rollout import (
 )
 from difflcs.rl.seeding import Stream, generator, number
 from difflcs.rl.settings import Epochs, Rollouts, Settings, bounded, group
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
 
 NOISE = 0.9
 """Standard deviation of ε, the noise of the sampled actions, as a fraction of the action bounds' half range: that of

@@ -5,14 +5,13 @@ Its episodes, with some noise, are the data; the few numbers of the physics are 
 episodes are better. A main phase may follow: PPO through the MPC (Algorithm 2), as in LCS-RL.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
@@ -23,10 +22,6 @@ from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
 from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
 
 # Xi of the violation loss. From 0.001 to 0.2 made no difference to the sugar box: .975, .970 and .980 of 200 goals.
 _XI = 0.02

@@ -6,30 +6,25 @@ imported, `train(...)` and the command line know it: `difflcs train --method min
 `Method` of all others. docs/contributing.md adds one.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from difflcs._checks import did_you_mean
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcs import LCSModel
+from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import get_backend
 from difflcs.records import LCSModule
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.rollout import Policy
 from difflcs.rl.settings import Settings, bounded
 from difflcs.rl.tasks import TaskSpec, single_start_backend
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
-    from difflcs.mpc import LCSMPCLayer
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from gymnasium.vector import VectorEnv
 
 from difflcs._optional import require, versions
 from difflcs._storage import check_path, short, write_json
@@ -26,10 +27,7 @@ from difflcs.rl.runs.evaluate import Evaluation, evaluate
 from difflcs.rl.settings import Settings, bounded, from_json
 from difflcs.rl.tasks import TaskSpec, get_task
 
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
-EnvFactory = Callable[[int], "VectorEnv"]
+EnvFactory = Callable[[int], VectorEnv]
 """Number of environments → a vector of them, stepped in lockstep."""
 EVALUATION_ENVS = 50
 """Environments of an evaluation: enough to keep the solver's workers busy, few enough to build in a second."""
