@@ -1,6 +1,8 @@
 """Shared builders of small models, as fixtures; and how many threads the tests may use."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,14 @@ def refuse(error, match: str, function: Callable, *args, **kwargs) -> str:
     kinds = {kind.__name__ for kind in type(caught.value).__mro__}
     assert error is ValueError or {"DiffLCSError", "DifflcsEnvsError"} & kinds
     return str(caught.value)
+
+
+def python(*arguments: str | Path, fails: bool = False, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run Python with arguments, such as "-c" and code, in a process of its own, which has to end well, or to fail."""
+    options = {"capture_output": True, "text": True, "timeout": 120, "check": False, **options}
+    done = subprocess.run([sys.executable, *arguments], **options)
+    assert fails == (done.returncode != 0), done.stdout[-2000:] + done.stderr[-2000:]
+    return done
 
 
 def tensor(values: Sequence[Any] | float) -> Tensor:

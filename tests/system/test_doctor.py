@@ -2,14 +2,13 @@
 
 import json
 import re
-import subprocess
-import sys
 from importlib import metadata
 
 import pytest
 
 from difflcs import available_backends, cli
 from difflcs.cli import doctor
+from tests.conftest import python
 
 OPTIONAL = (
     "gymnasium", "mujoco", "torchrl", "tensordict", "tensorboard", "tqdm", "tyro", "cvxpy", "cvxpylayers", "trimesh",
@@ -166,8 +165,7 @@ from difflcs import __main__
 assert __main__.main(["train"]) == 2
 sys.exit(__main__.main(["doctor", "--json"]))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    done = python("-c", code)
     assert done.stderr.count("difflcs: ") == 1
     assert "expected the package(s) gymnasium, not installed; run: pip install" in done.stderr  # of `difflcs train`
     every = json.loads(done.stdout)["checks"]

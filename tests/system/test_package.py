@@ -2,25 +2,18 @@
 
 import ast
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import difflcs
+from tests.conftest import python
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = (
     "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
     "trimesh", "coacd", "numba", "filelock", "pooch", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
 )  # fmt: skip
-
-
-def run(code):
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
 
 
 def sources(folder):
@@ -53,7 +46,8 @@ STEPS = (
 @pytest.fixture(scope="module")
 def loaded():
     """Names of the modules after each step."""
-    return [set(names.split()) for names in run("\nprint(*sys.modules)\n".join([*dict(STEPS), ""])).splitlines()]
+    printed = python("-c", "\nprint(*sys.modules)\n".join([*dict(STEPS), ""])).stdout
+    return [set(names.split()) for names in printed.splitlines()]
 
 
 @pytest.mark.parametrize("step", range(1, len(STEPS)))
@@ -63,8 +57,9 @@ def test_nothing_is_imported_before_it_is_needed(loaded, step):
 
 
 def test_import_leaves_global_state_alone():
-    assert (
-        run("""
+    done = python(
+        "-c",
+        """
 import torch, warnings, signal, random
 import numpy as np
 before = torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(), len(warnings.filters)
@@ -73,9 +68,9 @@ import difflcs
 assert before == (torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(), len(warnings.filters))
 assert torch.equal(state[0], torch.random.get_rng_state()) and state[1] is signal.getsignal(signal.SIGINT)
 print("same")
-""").strip()
-        == "same"
+""",
     )
+    assert done.stdout.strip() == "same"
 
 
 def test_every_exported_name_exists_and_is_documented():
@@ -105,10 +100,7 @@ def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):
     assert blocks, "README.md has no python example"
     script = tmp_path / "example.py"
     script.write_text(blocks[0])
-    done = subprocess.run(
-        [sys.executable, "-W", "error", script], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    done = python("-W", "error", script, cwd=tmp_path)
     assert re.search(r"tensor\(|\d\.\d", done.stdout), "nothing was printed that looks like a gradient"
     numbers = [float(v) for v in re.findall(r"-?\d+\.\d*(?:e[+-]?\d+)?", done.stdout)]
     assert any(v != 0 for v in numbers)

@@ -1,7 +1,5 @@
 """Tests that measure time. `make test` runs them after all others, alone, so that nothing else slows them."""
 
-import subprocess
-import sys
 import time
 
 import pytest
@@ -11,12 +9,13 @@ from difflcs import LCSMPCLayer, Status, solve_lcp, violation_loss
 from difflcs.errors import SolveWarning
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
+from tests.conftest import python
 
 
 def test_import_takes_less_than_one_and_a_half_times_that_of_torch():
     def seconds(module):
         code = f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"
-        return float(subprocess.check_output([sys.executable, "-c", code], timeout=120))
+        return float(python("-c", code).stdout)
 
     torch, ours = [], []
     for _ in range(6):  # interleaved, the best of each: a noisy neighbour slows both
@@ -130,9 +129,7 @@ for name, work in works.items():
 @pytest.fixture(scope="module")
 def interrupted():
     """What each kind of native work does about Ctrl-C, one after the other in one process."""
-    done = subprocess.run([sys.executable, "-c", INTERRUPT], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return dict(line.split(": ") for line in done.stdout.splitlines())
+    return dict(line.split(": ") for line in python("-c", INTERRUPT).stdout.splitlines())
 
 
 @pytest.mark.parametrize("work", ["batched", "lcp", "relaxed lcp", "violation_loss", "ipopt"])

@@ -3,9 +3,6 @@
 Each test is a failure that was once met, at its smallest; `tests/conformance/hostile` searches for more of their kind.
 """
 
-import subprocess
-import sys
-
 import pytest
 import torch
 
@@ -14,6 +11,7 @@ from difflcs.errors import DegenerateWarning, SolveWarning
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
+from tests.conftest import python
 
 F64 = torch.float64
 
@@ -167,5 +165,4 @@ def test_a_thread_that_cannot_start_costs_speed_only():
         "plan.action.sum().backward()\n"
         "print(bool(plan.converged.all()), bool(torch.isfinite(model.A.grad).all()))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout.split() == ["True", "True"], done.stdout + done.stderr
+    assert python("-c", code).stdout.split() == ["True", "True"]

@@ -18,6 +18,7 @@ from difflcs.cli.bench import pushing_model
 from difflcs.errors import SolveWarning
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.systems import cart_pole_between_walls, pushing_cost
+from tests.conftest import python
 
 
 def pushing(build, n_lam, system=0, lcs=None, on_failure="raise", **options):
@@ -131,8 +132,7 @@ kernels = module_from_spec(spec)
 spec.loader.exec_module(kernels)
 kernels.isa()"""
     environment = {**os.environ, "DIFFLCS_ISA": "mmx"}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode != 0
+    done = python("-c", script, fails=True, env=environment)
     assert "DIFFLCS_ISA=mmx is not available: expected baseline, avx2 or avx512" in done.stderr
 
 

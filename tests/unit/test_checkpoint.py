@@ -4,8 +4,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
 from difflcs.rl.learning.state_tree import flatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from tests.conftest import contents, refuse
+from tests.conftest import contents, python, refuse
 
 
 def make_model(seed: int) -> LCSModel:
@@ -156,7 +154,7 @@ def test_a_run_in_use_is_refused_to_another_process(tmp_path):
         f"from pathlib import Path; from difflcs import _storage; _storage.locked(Path({str(tmp_path)!r})).__enter__()"
     )
     with RunDirectory(tmp_path).locked():
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        done = python("-c", code, fails=True)
     assert f"InUseError: {tmp_path}" in done.stderr
     assert re.search("in use; wait until .* another --out", done.stderr)
 

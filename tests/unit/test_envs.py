@@ -3,7 +3,6 @@
 import copy
 import math
 import pickle
-import subprocess
 import sys
 
 import gymnasium
@@ -17,7 +16,7 @@ from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend
 from difflcs_envs.trifinger import kinematics
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv
 from difflcs_envs.trifinger.model import FINGER_YAWS
-from tests.conftest import refuse
+from tests.conftest import python, refuse
 
 OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)  # (3, 2)
 REST = np.zeros(6)
@@ -49,7 +48,7 @@ def test_import_does_not_load_mujoco_and_what_needs_it_names_the_install_line():
         "    assert 'pip install \"difflcs[envs]\"' in str(error)\n"
         "else:\n    raise SystemExit('no error')"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python("-c", code)
 
 
 def test_truncates_after_20_steps_and_never_terminates():

@@ -1,7 +1,5 @@
 """What the environments publish to the library: every number of a task is that of its environment."""
 
-import subprocess
-import sys
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +10,7 @@ from difflcs.rl.tasks import get_task
 from difflcs.systems import pushing_cost
 from difflcs_envs.tasks import MOVE, caption, contact_cost, trifinger_task
 from difflcs_envs.ycb import YCB
+from tests.conftest import python
 
 NAMES = ("cube", "turn_cube", *YCB)
 
@@ -27,7 +26,7 @@ def test_what_a_program_registers_itself_is_not_replaced_by_what_is_installed():
         "mine = register_task(trifinger_task('cube', 'TriFingerMoveCube-v0', MOVE, 'Mine.', ()))\n"
         "assert get_task('cube') is mine and 'mug' in task_names()"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python("-c", code)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -81,7 +80,7 @@ def test_the_outcome_of_a_step_needs_no_torch():
         "MOVE.outcome(np.zeros(9), np.zeros(6), np.zeros(9), np.zeros(3), True)\n"
         "assert 'torch' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python("-c", code)
 
 
 def test_the_cost_of_contact_plans_is_what_it_says():

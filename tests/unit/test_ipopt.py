@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import textwrap
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, ipopt
 from difflcs.systems import pushing_cost
 from tests.conformance.varied.generators import random_case
-from tests.conftest import refuse
+from tests.conftest import python, refuse
 
 
 @pytest.fixture
@@ -94,11 +93,7 @@ def run_script(code, timeout=90):
     with tempfile.NamedTemporaryFile("w", suffix=".py") as script:
         script.write(textwrap.dedent(head) + textwrap.dedent(code))
         script.flush()
-        done = subprocess.run(
-            [sys.executable, script.name], capture_output=True, text=True, timeout=timeout, check=False
-        )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout.split()
+        return python(script.name, timeout=timeout).stdout.split()
 
 
 @pytest.mark.slow

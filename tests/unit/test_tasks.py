@@ -1,8 +1,6 @@
 """Tasks: what they are made of, what is refused, and how they are found."""
 
 import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import gymnasium
@@ -16,7 +14,7 @@ from difflcs.rl.rollout import PolicyOutput, collect, noisy_actions, uniform_act
 from difflcs.rl.runs.figures import record_video
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
-from tests.conftest import refuse
+from tests.conftest import python, refuse
 
 TOY = make_task()
 
@@ -200,9 +198,7 @@ def test_a_broken_entry_point_is_named_and_disturbs_no_other(tmp_path):
         "try:\n    get_task('raises')\nexcept Exception as error:\n    print(error)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.getcwd(), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path}
-    )
+    done = python("-c", code, env={**os.environ, "PYTHONPATH": path})
     names, _, message = done.stdout.partition("\n")
     assert {"good", "cube"} <= set(names.split())
     assert "raises = raises_tasks:register could not be loaded: RuntimeError: out of order" in message
