@@ -20,8 +20,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_shape, check_tensor
 from difflcs.errors import ContactWarning, InvalidInputError, warn
-from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
-from difflcs.physics.mujoco.library import Places, library
+from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import Rows
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 from difflcs.physics.mujoco.native import flags
@@ -49,7 +48,7 @@ class WholeStep:
     """
 
     def __init__(self, motion: Dynamic, limits: bool):
-        self.model = motion.model
+        self.model, self._motion = motion.model, motion
         self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
 
     def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
@@ -60,13 +59,10 @@ class WholeStep:
             states: (n, nq + nv + na) qpos, qvel and act.
             ctrl: (n, nu) controls.
         """
-        after = np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
-        native = places.take(len(states))
         try:
-            places.check(_mujoco.simulate(library(), self._native, native, states, ctrl, after), len(states))
+            return self._motion.run(self._native, places, states, ctrl)
         except InvalidInputError:  # the systems stand without a correction
-            after[:] = np.nan
-        return after
+            return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
 
     def follow(self, places: Places, state: MujocoState, control: Any, x: Tensor, u: Tensor) -> Tensor | None:
         """Follow states (..., H, n_x) from x (..., n_x), one before each of actions u (..., H, n_u).

@@ -23,12 +23,12 @@ from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
 from difflcs.physics.mujoco.nominal import Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
-from difflcs.physics.mujoco.readings import Readings
+from difflcs.physics.mujoco.readings import Readings, read_each
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along

@@ -32,7 +32,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response, native
+from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,8 @@ _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and lat
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}", -1))
     for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 )
+_FAR = 0.5  # turn of a joint in a step [rad], in which what drives do changes
+_DIFFERENCE = 1e-4  # in parts of the size of actions
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
 
@@ -85,11 +87,9 @@ class QuasiStatic:
                     'mobility: expected damping above 0 of all joints that are pushed with "damping", got '
                     f'{float(damping.min()):g}; set it in the model, use "inertia", or give the mobility'
                 )
-            fixed = np.zeros(nv)
-            fixed[self.pushed] = 1 / damping
-        else:
-            fixed = mobility
-        fixed = np.diag(fixed) if fixed.ndim == 1 else fixed
+            mobility = np.zeros(nv)
+            mobility[self.pushed] = 1 / damping
+        fixed = np.diag(mobility) if mobility.ndim == 1 else mobility
         if fixed.shape != (nv, nv) or not np.isfinite(fixed).all():
             raise InvalidInputError(
                 f"mobility: expected finite numbers ({nv},) or ({nv}, {nv}), got {fixed.shape}; one for each degree of "
@@ -124,24 +124,6 @@ class QuasiStatic:
         return FreeMotion(*matrices)
 
 
-def read_each(motion: Any, places: Places, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
-    """Read a motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu); of positions one by one.
-
-    Raises:
-        InvalidInputError: MuJoCo raised an error, or has counted a warning.
-    """
-    if isinstance(motion, Dynamic):
-        return motion.read(places, states, ctrl)
-    moved = motion.allocate(len(states))
-    for i, state in enumerate(states):
-        with native(model, data, f"in state {i} of {len(states)}"):
-            data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq : model.nq + model.nv]
-            data.act[:] = state[model.nq + model.nv :]
-            mujoco.mj_fwdPosition(model, data)
-            motion.read(i, data, moved, ctrl[i])
-    return moved
-
-
 class Dynamic:
     """Motion by all forces of MuJoCo except those of its constraints, linearised at each state.
 
@@ -166,6 +148,7 @@ class Dynamic:
         self._models: list[Any] = []
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
+        self.hinges = model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_HINGE)
         self.firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
@@ -198,18 +181,31 @@ class Dynamic:
     def find_secants(self, read: Linearised, places: Places, states: Array, x: Array) -> Linearised:
         """Add lines nearest to ends and middles of ranges, for actuators whose force is not linear in the control.
 
-        The states are those of MuJoCo and of the system, (n, n_x).
+        Where joints turn far in the step, what is linear half way says little, and differences of the simulation stand
+        for all actuators. The states are those of MuJoCo and of the system, (n, n_x).
         """
-        ctrl = read.nominal + x[:, : self.model.nv] @ self.moment.T
-        secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
-        for k, i in enumerate(self.actuators.curved):
+        nv, nu = self.model.nv, self.model.nu
+        ctrl = read.nominal + x[:, :nv] @ self.moment.T
+        fast = (np.abs(read.reached[:, :nv])[:, self.hinges] > _FAR).any(-1) & ~read.unstable
+        secants = np.full((*read.reached.shape, nu * (len(self.actuators.curved) > 0 or fast.any())), np.inf)
+        if nu and fast.any():
+            changes = _DIFFERENCE * np.diag(self.actuators.reach)[:, None]
+            ends = self.actuators.clip(ctrl[fast] + np.stack([changes, -changes]))  # of each actuator
+            after = self.run(
+                self._native[self.simulated], places, np.tile(states[fast], (2 * nu, 1)), ends.reshape(-1, nu)
+            )
+            ahead, behind = after.reshape(2, nu, -1, len(read.reached.T))
+            apart = np.maximum(np.einsum("knk->kn", ends[0] - ends[1]), 1e-12)
+            secants[fast] = np.moveaxis((ahead - behind) / apart[:, :, None], 0, -1)
+        for i in self.actuators.curved:
             ends = np.concatenate([part * (self.actuators.range[:, i, None] - ctrl[:, i]) for part in (0.5, 1.0)])
+            secants[:, :, i] = 0.0
             for end in ends:
                 other = ctrl.copy()
                 other[:, i] += end
                 after = self.simulate(places, states, other, read.unstable)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
+                    secants[:, :, i] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
 
     def simulate(
@@ -225,10 +221,14 @@ class Dynamic:
         for steps, some in ((self.simulated, ~unstable), (self.finer, None)):
             some = ~(np.abs(after).max(1) < _FAST_MOTION) if some is None else some
             if some.any():
-                part = after[some]
-                taken = places.take(len(part)), states[some], ctrl[some], part
-                places.check(_mujoco.simulate(library(), described[steps], *taken), len(part))
-                after[some] = part
+                after[some] = self.run(described[steps], places, states[some], ctrl[some])
+        return after
+
+    def run(self, described: _mujoco.Motion, places: Places, states: Array, ctrl: Array) -> Array:
+        """Do so by the steps that are `described`; NaN where MuJoCo warns."""
+        after = np.empty((len(states), 2 * self.model.nv + self.model.na))
+        taken = places.take(len(after)), states, ctrl, after
+        places.check(_mujoco.simulate(library(), described, *taken), len(after))
         return after
 
     def _read(self, steps: Steps, places: Places, states: Array, ctrl: Array) -> Linearised:
@@ -322,7 +322,7 @@ class Dynamic:
         simulated = step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated, factor)
         if (some := read.unstable).any():
             simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, factor)
-        curved = self.actuators.curved[: read.secant.shape[2]] + n_x
+        curved = np.arange(read.secant.shape[2]) + n_x
         more = (read.reached - _reached(simulated, velocity))[:, :, None]
         more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
@@ -353,6 +353,8 @@ class Dynamic:
             if steps.integrator == _DISCRETE:  # at the position after the step
                 rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
                 response = implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+                turns = h * h * mass @ forces[:, :nv, :nv]  # of stiff forces that turn with the bodies, a part is skew
+                response = np.linalg.solve(np.eye(nv) + 0.5 * response @ (turns.swapaxes(-1, -2) - turns), response)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
             else:
                 one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ rates)
@@ -399,7 +401,7 @@ class Linearised(NamedTuple):
         nominal: (n, nu) action at which this is.
         reached: (n, n_x) where the nominal control leads in a step.
         unstable: (n,) True where this is in finer steps, as the model's are unstable.
-        secant: (n, n_x, k) what a unit of control brings about by `Actuators.curved`; k = 0: as linearised.
+        secant: (n, n_x, nu) what a unit of control brings about, infinite where it is as linearised; (n, n_x, 0): all.
     """
 
     middle: Array
