@@ -10,9 +10,8 @@ from difflcs.physics.mujoco import MujocoLCS
 
 
 def load(worldbody, rest=""):
-    return mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep=".001"/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
-    )
+    text = f'<mujoco><option timestep=".001"/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
+    return mujoco.MjModel.from_xml_string(text)
 
 
 def hinge(words=""):

@@ -24,9 +24,8 @@ from tests.conftest import refuse
 PLANE = '<joint name="{0}x" type="slide" axis="1 0 0"/><joint name="{0}y" type="slide" axis="0 1 0"/>'
 PUSHER = f"""
 <body name="pusher">{PLANE.format("p")}<geom name="tip" type="sphere" size=".015" mass=".2" {{tip}}/></body>"""
-SERVOS = (
-    '<actuator><position joint="px" kp="1000" dampratio="1"/><position joint="py" kp="1000" dampratio="1"/></actuator>'
-)
+SERVO = '<position joint="{}" kp="1000" dampratio="1"/>'
+SERVOS = f"<actuator>{SERVO.format('px')}{SERVO.format('py')}</actuator>"
 
 
 def load(worldbody, rest="", options=""):
@@ -193,9 +192,8 @@ def test_pairs_are_those_of_the_model_or_those_named():
     assert count(pairs=[("pusher", "other"), ("tip", 0)]) == 2
     x = tensor(0.1, 0.0, -0.1, 0.02, 0.0)
     named = MujocoLCS(model('contype="0" conaffinity="0"'), pairs=[("ball", "block")], distance=1.0).contacts(x)
-    assert named.gap.tolist() == pytest.approx(
-        [MujocoLCS(model(), pairs=[("ball", "block")]).contacts(x).gap[0].item()]
-    )
+    same = MujocoLCS(model(), pairs=[("ball", "block")]).contacts(x)
+    assert named.gap.tolist() == pytest.approx(same.gap[:1].tolist())
     assert count(pairs=[]) == 0
 
 
@@ -237,12 +235,9 @@ def test_there_is_room_for_all_contacts_that_mujoco_finds(first, second):
 
 
 def tower(boxes):
-    floor, size = '<geom type="plane" size="1 1 .1"/>', 0.1
-    stacked = (
-        f'<body pos="0 0 {(k + 0.5) * size - 1e-4}"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>'
-        for k in range(boxes)
-    )
-    return load(floor + "".join(stacked))
+    body = f'<body pos="0 0 {{}}"><freejoint/><geom {FACES["box"]} mass="1"/></body>'
+    stacked = "".join(body.format(0.1 * k + 0.0499) for k in range(boxes))
+    return load('<geom type="plane" size="1 1 .1"/>' + stacked)
 
 
 def test_geoms_that_cannot_touch_are_told_where_something_should_be_pushed():
@@ -280,12 +275,9 @@ def test_a_tower_stands_on_four_contacts_a_face():
 
 @pytest.mark.parametrize("flag", ["contact", "constraint"])
 def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
-    model = load(
-        '<geom name="slab" type="box" size=".3 .3 .05"/>'
-        f"""
-        <body pos="0 0 .105"><freejoint/><geom name="cube" {FACES["box"]}/></body>""",
-        f'<option><flag {flag}="disable"/></option>',
-    )
+    cube = f'<body pos="0 0 .105"><freejoint/><geom name="cube" {FACES["box"]}/></body>'
+    slab = '<geom name="slab" type="box" size=".3 .3 .05"/>'
+    model = load(slab + cube, f'<option><flag {flag}="disable"/></option>')
     x = torch.zeros(12).double()
     x[2] = 0.105
     assert MujocoLCS(model, motion="dynamic").n_contacts == 0
@@ -415,22 +407,16 @@ TORUS = f"""
   <asset><mesh name="torus"><plugin instance="t"/></mesh></asset>
   <worldbody><geom name="torus" type="sdf" mesh="torus"><plugin instance="t"/></geom>{SPHERE}</worldbody></mujoco>"""
 FLAG = SERVOS + '<option><flag {}="{}"/></option>'
+GROUP = SERVOS + '<option actuatorgroupdisable="0"/>'
+ADHESION = SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>')
 SINCE_MUJOCO_4 = hasattr(mujoco.MjModel, "nhistory")
 # What stands beside the servos of a box and its pusher, the options, and what the error says.
 RESTS = {
-    "a group of actuators that is disabled": (
-        SERVOS + '<option actuatorgroupdisable="0"/>',
-        {},
-        "not disabled.* got actuator 0, actuator 1; rem",
-    ),
+    "a group of actuators that is disabled": (GROUP, {}, "not disabled.* got actuator 0, actuator 1; rem"),
     "actuators that a flag disables": (FLAG.format("actuation", "disable"), {}, "not disabled"),
     "friction of two kinds": (SERVOS + PAIR, {}, "got 1 and 0.1 between geoms 'block' and 'tip'"),
     "friction by override": (SERVOS + OVERRIDE, {}, "got 0.9 and 0.8"),
-    "adhesion": (
-        SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>'),
-        {"motion": "dynamic"},
-        "no <adhesion>, .* got actuator 2; remove or",
-    ),
+    "adhesion": (ADHESION, {"motion": "dynamic"}, "no <adhesion>, .* got actuator 2; remove or"),
     "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
     "no actuators": ("", {}, "actuators"),
     "a motion": (SERVOS, {"motion": "fast"}, "quasi-static"),

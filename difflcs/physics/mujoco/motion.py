@@ -45,7 +45,7 @@ _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and lat
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}", -1))
     for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 )
-_FAR = 0.5  # turn of a joint in a step [rad], in which what drives do changes
+_HINGE, _FAR = int(mujoco.mjtJoint.mjJNT_HINGE), 0.5  # turn of it in a step [rad], in which what drives do changes
 _DIFFERENCE = 1e-4  # in parts of the size of actions
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
@@ -109,14 +109,12 @@ class QuasiStatic:
 
     def finish(self, arrays: Array, x: Array, tangent: Array | None) -> FreeMotion:
         """Return the motion at states x (n, nv), for the tangent of their rotations."""
-        n, nv = x.shape
-        if self.mobility is None:
+        (n, nv), response = x.shape, self.mobility
+        if response is None:
             block = np.ix_(np.arange(n), self.pushed, self.pushed)
             response = np.zeros((n, nv, nv))
             # What the servos hold does not give way, so the mass matrix counts without their rows.
             response[block] = np.linalg.inv(np.linalg.inv(arrays)[block])
-        else:
-            response = self.mobility
         if tangent is not None:
             inverse = np.linalg.inv(tangent)
             response = inverse @ response @ inverse.swapaxes(-1, -2)
@@ -148,7 +146,6 @@ class Dynamic:
         self._models: list[Any] = []
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
-        self.hinges = model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_HINGE)
         self.firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
@@ -184,28 +181,25 @@ class Dynamic:
         Where joints turn far in the step, what is linear half way says little, and differences of the simulation stand
         for all actuators. The states are those of MuJoCo and of the system, (n, n_x).
         """
-        nv, nu = self.model.nv, self.model.nu
-        ctrl = read.nominal + x[:, :nv] @ self.moment.T
-        fast = (np.abs(read.reached[:, :nv])[:, self.hinges] > _FAR).any(-1) & ~read.unstable
-        secants = np.full((*read.reached.shape, nu * (len(self.actuators.curved) > 0 or fast.any())), np.inf)
-        if nu and fast.any():
-            changes = _DIFFERENCE * np.diag(self.actuators.reach)[:, None]
-            ends = self.actuators.clip(ctrl[fast] + np.stack([changes, -changes]))  # of each actuator
-            after = self.run(
-                self._native[self.simulated], places, np.tile(states[fast], (2 * nu, 1)), ends.reshape(-1, nu)
-            )
-            ahead, behind = after.reshape(2, nu, -1, len(read.reached.T))
-            apart = np.maximum(np.einsum("knk->kn", ends[0] - ends[1]), 1e-12)
-            secants[fast] = np.moveaxis((ahead - behind) / apart[:, :, None], 0, -1)
-        for i in self.actuators.curved:
-            ends = np.concatenate([part * (self.actuators.range[:, i, None] - ctrl[:, i]) for part in (0.5, 1.0)])
-            secants[:, :, i] = 0.0
+        nv, curved = self.model.nv, self.actuators.curved
+        ctrl, hinges = read.nominal + x[:, :nv] @ self.moment.T, self.model.jnt_type[self.model.dof_jntid] == _HINGE
+        fast = (np.abs(read.reached[:, :nv])[:, hinges] > _FAR).any(-1) & ~read.unstable
+        those = range(self.model.nu) if fast.any() else curved
+        secants = np.full((*read.reached.shape, self.model.nu * (len(those) > 0)), np.inf)
+        for i in those:
+            some = np.full_like(fast, True) if i in curved else fast
+            low, high = self.actuators.range[:, i, None] - ctrl[some, i]
+            size = _DIFFERENCE * self.actuators.reach[i]
+            near = [np.maximum(low, -size), np.minimum(high, size)]
+            ends = np.stack([0.5 * low, 0.5 * high, low, high] if i in curved else near)
+            secants[some, :, i] = 0.0
             for end in ends:
-                other = ctrl.copy()
+                other = ctrl[some]
                 other[:, i] += end
-                after = self.simulate(places, states, other, read.unstable)
+                taken, steps = (places, states[some], other), self._native[self.simulated]
+                after = self.simulate(*taken, read.unstable[some]) if i in curved else self.run(steps, *taken)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    secants[:, :, i] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
+                    secants[some, :, i] += (after - read.reached[some]) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
 
     def simulate(
