@@ -178,12 +178,12 @@ class Dynamic:
     def find_secants(self, read: Linearised, places: Places, states: Array, x: Array) -> Linearised:
         """Add lines nearest to ends and middles of ranges, for actuators whose force is not linear in the control.
 
-        Where joints turn far in the step, what is linear half way says little, and differences of the simulation stand
+        Where a joint turns far in a step, what is linear half way says little, and differences of the simulation stand
         for all actuators. The states are those of MuJoCo and of the system, (n, n_x).
         """
         nv, curved = self.model.nv, self.actuators.curved
         ctrl, hinges = read.nominal + x[:, :nv] @ self.moment.T, self.model.jnt_type[self.model.dof_jntid] == _HINGE
-        fast = (np.abs(read.reached[:, :nv])[:, hinges] > _FAR).any(-1) & ~read.unstable
+        fast = (self.seconds * np.abs(x[:, nv : 2 * nv][:, hinges]) > _FAR).any(-1) & ~read.unstable
         those = range(self.model.nu) if fast.any() else curved
         secants = np.full((*read.reached.shape, self.model.nu * (len(those) > 0)), np.inf)
         for i in those:
