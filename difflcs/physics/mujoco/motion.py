@@ -8,7 +8,7 @@ way there, with ζ the change of position and ν the velocity:
 K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs, damping,
 gears and servos are all in them. What differs from the simulation takes the time steps of the model's own integrator.
 Where actuators have activation, ζ stands for its change as well where it acts, and ν̇ for its rate where it changes.
-An actuator at a limit of its control or force has a constant force.
+An actuator at a limit of its control or force has a constant force. Where joints turn far, B is that of the simulation.
 
 A contact force acts as one impulse f at the beginning of the step, implicitly, so that what a stiff servo holds gives
 way little: it changes ν by S f and ζ by h S f with S = (M + [h (−M D) + h² (−M K)]₊)⁻¹, where [·]₊ is the part of the
