@@ -80,6 +80,7 @@ class QuasiStatic:
 
     def _fixed(self, mobility: str | Array) -> Array:
         nv = self.model.nv
+        fixed = np.zeros(nv) if isinstance(mobility, str) else mobility
         if isinstance(mobility, str):
             damping = self.model.dof_damping[self.pushed]
             if (damping <= 0).any():
@@ -87,9 +88,8 @@ class QuasiStatic:
                     'mobility: expected damping above 0 of all joints that are pushed with "damping", got '
                     f'{float(damping.min()):g}; set it in the model, use "inertia", or give the mobility'
                 )
-            mobility = np.zeros(nv)
-            mobility[self.pushed] = 1 / damping
-        fixed = np.diag(mobility) if mobility.ndim == 1 else mobility
+            fixed[self.pushed] = 1 / damping
+        fixed = np.diag(fixed) if fixed.ndim == 1 else fixed
         if fixed.shape != (nv, nv) or not np.isfinite(fixed).all():
             raise InvalidInputError(
                 f"mobility: expected finite numbers ({nv},) or ({nv}, {nv}), got {fixed.shape}; one for each degree of "
