@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <numeric>
 #include <utility>
 
 namespace difflcs {
@@ -38,28 +39,20 @@ class Alone final : public Runner {
 double seconds_since(Clock::time_point begun) { return std::chrono::duration<double>(Clock::now() - begun).count(); }
 
 bool all_finite(const double* values, int64_t count) {
-  bool finite = true;
-  for (int64_t i = 0; i < count; i++) finite = finite && std::isfinite(values[i]);
-  return finite;
+  return std::all_of(values, values + count, [](double v) { return std::isfinite(v); });
 }
 
 // to = matrix (rows, columns) * vector
 void multiply(const Numbers& matrix, const double* vector, int64_t rows, int64_t columns, double* to) {
-  for (int64_t i = 0; i < rows; i++) {
-    double sum = 0;
-    for (int64_t j = 0; j < columns; j++) sum += matrix.get()[i * columns + j] * vector[j];
-    to[i] = sum;
-  }
+  const double* row = matrix.get();
+  for (int64_t i = 0; i < rows; i++, row += columns) to[i] = std::inner_product(vector, vector + columns, row, 0.0);
 }
 
 // vector' * matrix * vector
 double quadratic(const Numbers& matrix, const double* vector, int64_t size) {
+  const double *row = matrix.get(), *end = vector + size;
   double total = 0;
-  for (int64_t i = 0; i < size; i++) {
-    double sum = 0;
-    for (int64_t j = 0; j < size; j++) sum += matrix.get()[i * size + j] * vector[j];
-    total += vector[i] * sum;
-  }
+  for (int64_t i = 0; i < size; i++, row += size) total += vector[i] * std::inner_product(vector, end, row, 0.0);
   return total;
 }
 
@@ -67,8 +60,7 @@ double quadratic(const Numbers& matrix, const double* vector, int64_t size) {
 void shift(const Numbers& from, int64_t rows, Numbers& to) {
   const int64_t width = from.count() / rows;
   std::memmove(to.get(), from.get() + width, sizeof(double) * size_t((rows - 1) * width));
-  if (to.get() != from.get())
-    std::memcpy(to.get() + (rows - 1) * width, from.get() + (rows - 1) * width, sizeof(double) * size_t(width));
+  std::memmove(to.get() + (rows - 1) * width, from.get() + (rows - 1) * width, sizeof(double) * size_t(width));
 }
 
 // Makes the numbers of unfinished plans finite, and adds a constant to the objectives, but for those of problems that

@@ -88,8 +88,7 @@ class Solver {
         if (k > 0)
           for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
         Vec low = data.u_min[j], high = data.u_max[j];
-        if (batch.barrier > 0)  // at most nine tenths of the way to a bound
-        {
+        if (batch.barrier > 0) {  // at most nine tenths of the way to a bound
           low = from - 0.9 * (from - low);
           high = from + 0.9 * (high - from);
         }
@@ -212,6 +211,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     progress.advance(o, sweep, frozen, moved, step, gain);
     const Mask first = progress.released & ~frozen;
     if (any(first)) progress.start_homotopy(o, first);
+    if (progress.exact(o, sweep, step) && !progress.take(o, counter, 0)) live--;
     progress.leave(o, counter, frozen | first, live);
   }
   if (progress.waiting) progress.certificate.judge(o, progress.finished, progress.waiting);

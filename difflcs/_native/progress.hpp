@@ -183,9 +183,23 @@ struct Progress {
     return o.status[lane[l].element] != int8_t(Status::numerical);
   }
 
+  // Whether the step led to the optimum, which it then stores: without contact and constraints a full step that ends
+  // inside all bounds is exact, and the certificate says so as well as another sweep. Of one problem alone.
+  bool exact(const MpcSolve& o, const Sweep& sweep, Vec step) {
+    if (kLanes > 1 || !problem.linear() || needs_rollout[0] || sweep.weak[0] || step[0] < 1) return false;
+    for (int64_t i = 0; i < at.u.size(); i++) {
+      const Vec low = problem.u_min[i / n.u()][i % n.u()], high = problem.u_max[i / n.u()][i % n.u()];
+      const Vec margin = kWeak * (high - low), u = at.u.entries[i];
+      if (!any((u - low > margin) & (high - u > margin))) return false;
+    }
+    return accepted(o, 0, sweep, problem.multiplier) && o.residual[lane[0].element] <= kMet;
+  }
+
   // A step of the multipliers, at the target of the homotopy: earlier they would follow plans that change.
   // They become those that the augmented Lagrangian has at the iterate.
-  void update_multipliers(Mask which) {
+  void update_multipliers(int l) {
+    Mask which = Mask{};
+    which[l] = -1;
     for (int64_t k = 0; k <= n.h; k++) {
       const StageData<T, AnySizes> data = k < n.h ? problem.stage(k) : problem.last();
       for (int64_t i = 0; i < n.c(); i++) {
@@ -195,12 +209,6 @@ struct Progress {
       }
     }
     stale_cost |= which;
-  }
-
-  static Mask lane_mask(int l) {
-    Mask which = Mask{};
-    which[l] = -1;
-    return which;
   }
 
   // Whether the constraints of a lane are met, except for a rest that no step of the multipliers reduces.
@@ -219,7 +227,7 @@ struct Progress {
         lane[l].in_stage >= kStepsBeforeUpdate && violated <= kSlightlyViolated && sweep.multiplier_step[l] > 0;
     if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
     lane[l].gradient_left = 0;
-    update_multipliers(lane_mask(l));
+    update_multipliers(l);
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
     if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
@@ -266,7 +274,7 @@ struct Progress {
       const double first = kPenalty * problem.weight[l];
       if (doubtful && !a.weight_reset && problem.rho[l] > first && o.residual[a.element] > kRoundingLeft) {
         frozen[l] = -1;
-        update_multipliers(lane_mask(l));
+        update_multipliers(l);
         put(&problem.rho, 0, l, first);
         lane[l].weight_reset = true;
         lane[l].violated = 1e300;
