@@ -11,9 +11,7 @@
 #include <atomic>
 #include <initializer_list>
 #include <limits>
-#include <optional>
 #include <stdexcept>
-#include <vector>
 
 #include "controller.hpp"
 

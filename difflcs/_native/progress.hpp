@@ -183,10 +183,10 @@ struct Progress {
     return o.status[lane[l].element] != int8_t(Status::numerical);
   }
 
-  // Whether the step led to the optimum, which it then stores: without contact and constraints a full step that ends
-  // inside all bounds is exact, and the certificate says so as well as another sweep. Of one problem alone.
+  // Whether an exact step (riccati.hpp) led to the optimum, which it then stores: if it was full and ended inside all
+  // bounds, the certificate says so as well as another sweep. Of one problem alone.
   bool exact(const MpcSolve& o, const Sweep& sweep, Vec step) {
-    if (kLanes > 1 || !problem.linear() || needs_rollout[0] || sweep.weak[0] || step[0] < 1) return false;
+    if (kLanes > 1 || needs_rollout[0] || !sweep.exact || sweep.weak[0] || step[0] < 1) return false;
     for (int64_t i = 0; i < at.u.size(); i++) {
       const Vec low = problem.u_min[i / n.u()][i % n.u()], high = problem.u_max[i / n.u()][i % n.u()];
       const Vec margin = kWeak * (high - low), u = at.u.entries[i];

@@ -38,6 +38,7 @@ struct Sweep {
   Vec largest_multiplier;
   Vec cost_gradient;  // sizes of the gradients of the cost in states and actions, added up over the stages
   Mask weak;          // a bound is weakly active, or the reduced Hessian is singular
+  bool exact;         // Newton's step is, within the bounds: all is linear, and no stage damped, flat or singular
 };
 
 // Value function of the steps from one on: Hessian, costate, and linear term.
@@ -124,7 +125,7 @@ class Riccati {
   // Around the trajectory `at`.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
-    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
+    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}, keeps};
     flat_damping = all(0);
     for (int64_t i = 0; i < n.c(); i++) {
       row_terms[i] = problem.reach[i];
@@ -381,6 +382,7 @@ class Riccati {
       held(k, j) = active[j];
       known[k] = known[k] && !any(~(data.R(j, j) > kPriced * abs(H(n.x() + j, n.x() + j))));
     }
+    result.exact = result.exact && known[k];
   }
 
   // Curvature that action j has at least, whatever its units.
