@@ -17,8 +17,8 @@ function(difflcs_add_kernels target)
                               $<$<NOT:$<CXX_COMPILER_ID:MSVC>>:-ffp-contract=off>)
   # So that a problem has the same plan whichever of them solves it: GCC would sum differently in vectors of its own.
   # Nor is there anything else for such vectors: numbers that are added up are already vectors of all lanes.
-  set_source_files_properties(${DIFFLCS_NATIVE}/mpc.cpp ${DIFFLCS_NATIVE}/mpc_adjoint.cpp PROPERTIES COMPILE_OPTIONS
-                              $<$<CXX_COMPILER_ID:GNU>:-fno-tree-vectorize>)
+  set_source_files_properties(${DIFFLCS_NATIVE}/mpc.cpp ${DIFFLCS_NATIVE}/mpc_adjoint.cpp ${DIFFLCS_NATIVE}/violation.cpp
+                              PROPERTIES COMPILE_OPTIONS $<$<CXX_COMPILER_ID:GNU>:-fno-tree-vectorize>)
   set(isas ${DIFFLCS_ISAS})
   if(isas STREQUAL "all")
     set(isas avx2 avx512)
@@ -31,21 +31,27 @@ function(difflcs_add_kernels target)
   if(NOT CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64|amd64)$")
     set(isas)
   endif()
-  if(NOT DIFFLCS_ISAS STREQUAL "here" OR NOT isas)
-    difflcs_add_instruction_set(${target} baseline 2)
-    if(isas)  # only for CPUs from before 2013: less to compile matters more than speed
-      target_compile_definitions(${target}_baseline PRIVATE DIFFLCS_FEWER_VARIANTS)
-    endif()
+  # Problems with code of their own for the sizes of the paper's tasks and of DIFFLCS_SIZES: 0 none, 1 those that share
+  # their matrices, 2 all. The C library has controllers, which have one problem.
+  set(sized 2)
+  if(DIFFLCS_C_LIBRARY)
+    set(sized 1)
+  endif()
+  if(avx512 IN_LIST isas)  # first, as it compiles longest
+    difflcs_add_instruction_set(${target} avx512 8 -mavx512f -mavx512dq -mavx512vl -mfma)
   endif()
   if(avx2 IN_LIST isas)
     difflcs_add_instruction_set(${target} avx2 4 -mavx2 -mfma)
   endif()
-  if(avx512 IN_LIST isas)
-    difflcs_add_instruction_set(${target} avx512 8 -mavx512f -mavx512dq -mavx512vl -mfma)
-  endif()
   # One problem alone, for every CPU that has AVX2. Clang would fuse other products and sums than in the others.
   if(isas AND CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
     difflcs_add_instruction_set(${target} single 1 -mavx2 -mfma)
+  endif()
+  if(NOT isas OR DIFFLCS_C_LIBRARY AND NOT DIFFLCS_ISAS STREQUAL "here")
+    difflcs_add_instruction_set(${target} baseline 2)
+  elseif(NOT DIFFLCS_ISAS STREQUAL "here")  # only for CPUs without AVX2: less to compile matters more than speed
+    set(sized 0)
+    difflcs_add_instruction_set(${target} baseline 2 $<$<CONFIG:Release>:-O2>)
   endif()
 endfunction()
 
@@ -76,11 +82,15 @@ function(difflcs_add_instruction_set target isa lanes)
     endif()
   endif()
   set_target_properties(${name} PROPERTIES POSITION_INDEPENDENT_CODE ON)
-  target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes})
+  target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes} DIFFLCS_SIZED=${sized})
   if(DIFFLCS_SIZES)
     target_compile_definitions(${name} PRIVATE DIFFLCS_SIZES=${DIFFLCS_SIZES})
   endif()
-  target_compile_options(${name} PRIVATE -fno-math-errno -Wno-psabi ${ARGN})
+  # Of GCC's -O3 without what takes an eighth of the time to compile and gains nothing here.
+  set(idle ipa-cp-clone split-paths tree-partial-pre gcse-after-reload predictive-commoning version-loops-for-strides
+      tree-loop-distribution loop-interchange loop-unroll-and-jam)
+  list(TRANSFORM idle REPLACE "(.+)" "$<$<CXX_COMPILER_ID:GNU>:-fno-\\1>")
+  target_compile_options(${name} PRIVATE -fno-math-errno -Wno-psabi ${idle} ${ARGN})
   target_sources(${target} PRIVATE $<TARGET_OBJECTS:${name}>)
   set_property(TARGET ${target} APPEND PROPERTY DIFFLCS_OBJECTS $<TARGET_OBJECTS:${name}>)
   target_compile_definitions(${target} PRIVATE DIFFLCS_LANES_${isa}=${lanes})

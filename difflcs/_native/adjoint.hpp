@@ -35,7 +35,7 @@ class Adjoint {
   }
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
-  int64_t layout(void* memory) {
+  DIFFLCS_NOINLINE int64_t layout(void* memory) {
     const int64_t h = n.h;
     Arena arena{memory};
     problem.layout(arena);

@@ -14,16 +14,15 @@ namespace {
 // A residual above this may be rounding of s, or hide behind it.
 constexpr double kSure = 2e-7;
 
-// T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
-template <class T>
+// Its matrices have an entry for each lane also where the problems share them, so that it is compiled once.
 struct Certificate {
   const MpcBatch& batch;
   const AnySizes n;
-  Steps<T> matrix[kInputs];    // in the caller's units: matrices here,
+  Steps<Vec> matrix[kInputs];  // in the caller's units: matrices here,
   Steps<Vec> vector[kInputs];  // vectors here
-  Steps<T> rest, transposed_A, transposed_Q;
+  Steps<Vec> rest, transposed_A, transposed_Q;
   // Of the current stage.
-  T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u, *A_t, *Q_t;
+  Vec *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u, *A_t, *Q_t;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
   // Sizes of all states, and at one stage of the costates and of rho's response to them (conditions.py: `sizes`); terms
@@ -35,7 +34,7 @@ struct Certificate {
 
   const bool shared;  // the matrices are loaded once, for all problems
 
-  explicit Certificate(const MpcBatch& b) : batch(b), n(b), shared(load_once<T>(b)) {}
+  explicit Certificate(const MpcBatch& b) : batch(b), n(b), shared(shared_matrices(b)) {}
 
   // `kept`: the memory has the shared matrices already.
   void layout(Arena& arena, bool kept) {
@@ -61,22 +60,20 @@ struct Certificate {
     arena.take(largest_action, nu);
     arena.take(moved, nc > 0 ? (h + 1) * nx : 0);
     arena.take_all(nc, row_terms, row_missed);
-    if (arena.memory && shared && !kept) load_matrices(0, 0);
+    for (int l = 0; l < kLanes && arena.memory && shared && !kept; l++) load_matrices(0, l);
   }
 
-  template <class Entry>
-  void load(Entry* to, const double* from, int64_t count, int lane) {
+  void load(Vec* to, const double* from, int64_t count, int lane) {
     for (int64_t i = 0; i < count; i++) put(to, i, lane, from[i]);
   }
-  template <class Entry>
-  void load(const Steps<Entry>& to, int which, int64_t e, int lane) {
+  void load(const Steps<Vec>& to, int which, int64_t e, int lane) {
     load(to.first, batch.at(which, e), to.count * to.size, lane);
   }
 
   void load_matrices(int64_t e, int lane) {
     for (int i = 0; i < kInputs; i++)
       if (kMpcFields[i].columns != Size::one) load(matrix[i], i, e, lane);
-    const auto transpose = [&](const Steps<T>& from, const Steps<T>& to) {
+    const auto transpose = [&](const Steps<Vec>& from, const Steps<Vec>& to) {
       for (int64_t k = 0; k < from.count; k++)
         for (int64_t i = 0; i < n.x() * n.x(); i++)
           put(to[k], i % n.x() * n.x() + i / n.x(), lane, lane_of(from[k][i], lane));
@@ -229,7 +226,7 @@ struct Certificate {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     enter(h);
     for (int64_t i = 0; i < nx; i++) {
-      const T* weights = matrix[kQ_final][0];
+      const Vec* weights = matrix[kQ_final][0];
       Vec t = vector[kq_final][0][i], all_terms = abs(t);
       for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
       for (int64_t j = 0; j < nx; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);

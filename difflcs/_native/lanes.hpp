@@ -4,16 +4,12 @@
 
 namespace difflcs::DIFFLCS_ISA {
 constexpr int kLanes = DIFFLCS_LANES;
-// Whether problems with separate matrices also have variants for the sizes of the paper's tasks; a controller has one.
-#if defined(DIFFLCS_FEWER_VARIANTS) || defined(DIFFLCS_C_LIBRARY)
-constexpr bool kSizedPerElement = false;
-#else
-constexpr bool kSizedPerElement = kLanes > 1;
-#endif
 }  // namespace difflcs::DIFFLCS_ISA
 #if DIFFLCS_LANES == 1
 #include "single_lane.hpp"
+#define DIFFLCS_NOINLINE_IN_LANES  // one problem alone would feel the calls
 #else
+#define DIFFLCS_NOINLINE_IN_LANES DIFFLCS_NOINLINE
 namespace difflcs::DIFFLCS_ISA {
 
 typedef double Vec __attribute__((vector_size(8 * DIFFLCS_LANES)));

@@ -85,9 +85,9 @@ struct Lcp {
   // Large problems check the watch in every iteration.
   bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
 
-  void slack() { lcp_slack(size(), F, q, lam, w, bound); }
+  DIFFLCS_NOINLINE void slack() { lcp_slack(size(), F, q, lam, w, bound); }
 
-  void solve(Vec* b) const {
+  DIFFLCS_NOINLINE void solve(Vec* b) const {
     const int64_t n = size();
     Local<N> x(b);
     DIFFLCS_UNROLL
@@ -207,12 +207,11 @@ void with_size(const LcpBatch& batch, void* memory, Function f) {
 }
 template <int... N, class Function>
 void dispatch(const LcpBatch& batch, void* memory, Function f) {
-  if (batch.F_stride == 0)
-    with_size<double, N...>(batch, memory, f);
-  else if constexpr (kSizedPerElement)
-    with_size<Vec, N...>(batch, memory, f);
+  const bool shared = batch.F_stride == 0;
+  if constexpr (DIFFLCS_SIZED > 1)
+    shared ? with_size<double, N...>(batch, memory, f) : with_size<Vec, N...>(batch, memory, f);
   else
-    with_size<Vec>(batch, memory, f);
+    shared ? with_size<double>(batch, memory, f) : with_size<Vec>(batch, memory, f);
 }
 
 }  // namespace

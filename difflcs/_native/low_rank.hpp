@@ -59,11 +59,13 @@ class LowRank {
   // Looks whether system k is of this kind.
   template <class Square, class Wide>
   void find(int64_t k, const Square& F, const Wide& C) const {
-    if (most == 0) return;
-    LowRank& one = *systems[k];
-    one = *this;
-    one.take(k, most);
-    one.take(k, one.describe(F, C) ? one.rank : 0);
+    if constexpr (kLanes == 1) {
+      if (most == 0) return;
+      LowRank& one = *systems[k];
+      one = *this;
+      one.take(k, most);
+      one.take(k, one.describe(F, C) ? one.rank : 0);
+    }
   }
 
   // Row i of the matrix has a_i and b_i.

@@ -49,7 +49,7 @@ inline void lu_factor_by_rows(int64_t n, Vec* M, Vec* scratch) {
 
 // The same numbers for a size that is not known when compiling. Four rows at a time eliminate all below them, which are
 // so read and written a quarter as often.
-inline void lu_factor_by_panels(int64_t n, Vec* M) {
+DIFFLCS_NOINLINE inline void lu_factor_by_panels(int64_t n, Vec* M) {
   constexpr int64_t kPanel = 4;
   for (int64_t start = 0; start < n; start += kPanel) {
     const int64_t end = start + kPanel < n ? start + kPanel : n;
@@ -121,7 +121,7 @@ DIFFLCS_INLINE void substitute_backward(int64_t n, const Vec* M, V* b, int64_t i
   }
 }
 template <class V>
-inline void lu_solve_by_rows(int64_t n, const Vec* M, V* b) {
+DIFFLCS_NOINLINE void lu_solve_by_rows(int64_t n, const Vec* M, V* b) {
   constexpr int kRows = 4;
   int64_t i = 0;
   for (; i + kRows <= n; i += kRows) substitute_forward<kRows>(n, M, b, i);
@@ -142,7 +142,7 @@ inline void lu_solve_transposed(N n, const Vec* M, Vec* b) {
 
 // The same with row exchanges, lane by lane, for the few problems where elimination without them loses digits. Like
 // LAPACK, rows[k] is the row that was exchanged with row k.
-inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
+DIFFLCS_NOINLINE inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
   for (int l = 0; l < kLanes; l++) {
     auto at = [&](int64_t i, int64_t j) -> double& { return reinterpret_cast<double*>(M + i * n + j)[l]; };
     for (int64_t k = 0; k < n; k++) {
@@ -178,7 +178,7 @@ inline void exchange(V* b, int64_t k, const Mask* rows) {
 }
 
 template <class V>
-inline void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, V* b) {
+DIFFLCS_NOINLINE void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, V* b) {
   for (int64_t k = 0; k < n; k++) exchange(b, k, rows);
   lu_solve(n, M, b);
 }

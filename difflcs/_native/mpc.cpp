@@ -19,6 +19,10 @@
 
 namespace difflcs::DIFFLCS_ISA {
 
+int64_t solver_workspace(const MpcBatch& batch) {
+  return Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+}
+
 void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch) {
   dispatch(batch, [&](auto variant) {
     using V = decltype(variant);

@@ -6,14 +6,13 @@
 #endif
 #include "adjoint.hpp"
 #include "kernels.hpp"
-#include "newton.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 
 // Of the solver and the adjoint; that of the widest variant serves all.
 int64_t mpc_workspace(const MpcBatch& batch) {
-  const int64_t solve = Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+  const int64_t solve = solver_workspace(batch);
   const int64_t adjoint = Adjoint<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
   return solve > adjoint ? solve : adjoint;
 }

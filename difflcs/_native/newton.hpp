@@ -33,7 +33,7 @@ class Solver {
   }
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
-  int64_t layout(void* memory) {
+  DIFFLCS_NOINLINE int64_t layout(void* memory) {
     Arena arena{memory};
     problem.layout(arena);
     progress.layout(arena);

@@ -59,7 +59,7 @@ struct Progress {
   const MpcBatch& batch;
   const AnySizes n;
   ProblemData<T>& problem;
-  Certificate<T> certificate;
+  Certificate certificate;
   Trajectory<AnySizes> at;  // the iterate
   Vec* gap;
 

@@ -392,7 +392,7 @@ class Riccati {
   }
 
   // H_uu + Y_uu + regularisation.
-  void action_hessian(const StageData<T, S>& data) {
+  DIFFLCS_NOINLINE_IN_LANES void action_hessian(const StageData<T, S>& data) {
     const int64_t nx = n.x();
     linearisation.curvatures(
         nx, n.w(), nx, [](int64_t i) { return i + 1; },
@@ -423,7 +423,7 @@ class Riccati {
   }
 
   // The factor L of H_uu, with reciprocal pivots on the diagonal. Returns where a pivot was lifted.
-  Mask cholesky(const StageData<T, S>& data, bool judged) {
+  DIFFLCS_NOINLINE_IN_LANES Mask cholesky(const StageData<T, S>& data, bool judged) {
     const int64_t nx = n.x(), nu = n.u();
     Mask failed = Mask{};
     for (int64_t i = 0; i < nu; i++)

@@ -11,10 +11,6 @@ namespace {
 
 constexpr double kTiny = 1e-300;
 
-// Whether the type of an entry says that all problems share their matrices; with one lane it does not.
-template <class T>
-constexpr bool kShared = std::is_same_v<T, double> && kLanes > 1;
-
 // n_x, n_u, n_lam, n_x + n_u, n_c and the horizon; compile-time where the template argument is not zero.
 template <int X, int U, int L>
 struct Sizes {
@@ -36,10 +32,10 @@ inline bool shared_matrices(const MpcBatch& b) {
   return shared;
 }
 
-// Whether matrices are loaded once for all problems.
+// Whether matrices are loaded once for all problems: the type of an entry says so, except with one lane.
 template <class T>
 bool load_once(const MpcBatch& b) {
-  return kLanes > 1 ? kShared<T> : shared_matrices(b);
+  return kLanes > 1 ? std::is_same_v<T, double> : shared_matrices(b);
 }
 
 // R_jj + B_j' Q B_j of each action at each stage: its curvature by the next state's weights Q alone, in one lane.

@@ -5,6 +5,10 @@
 #include "sizes.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
+
+// Size of a workspace of the solver alone (mpc.cpp).
+int64_t solver_workspace(const MpcBatch& batch);
+
 namespace {
 
 template <class Entry, class Sizes>
@@ -20,7 +24,7 @@ using Widest = Variant<std::conditional_t<kLanes == 1, double, Vec>, AnySizes>;
 #define DIFFLCS_SIZES
 #endif
 constexpr int kOwn[] = {9, 6, 5, 9, 6, 8, DIFFLCS_SIZES};
-constexpr int kOwnCount = int(sizeof(kOwn) / sizeof(int)) / 3;
+constexpr int kOwnCount = DIFFLCS_SIZED ? int(sizeof(kOwn) / sizeof(int)) / 3 : 0;
 
 // Calls f with the variant for matrices with entries T that fits: that of size number i, or of a later one.
 template <class T, int i = 0, class Function>
@@ -40,7 +44,7 @@ void dispatch(const MpcBatch& b, Function f) {
     f(Widest());
   else if (kLanes == 1 || shared_matrices(b))
     dispatch_sizes<double>(b, f);
-  else if constexpr (kSizedPerElement)
+  else if constexpr (DIFFLCS_SIZED > 1 && kLanes > 1)
     dispatch_sizes<Vec>(b, f);
   else
     f(Widest());
