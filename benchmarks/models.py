@@ -99,10 +99,6 @@ def chain(lcs: LCSParams, horizon: int, count: int, seed: int, others: float = 0
     return make(lcs, push_the_last_cart(carts, horizon, others), horizon, 50.0, x0)
 
 
-def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:
-    return chain(chain_of_carts(carts, dt, stiffness), horizon, count, carts + horizon)
-
-
 OBJECTS = ("cube", "mug", "wrench", "banana")
 
 # `count` problems of each of a family's models.
@@ -116,6 +112,6 @@ FAMILIES: dict[str, Callable[[int], list[Instance]]] = {
     "random, n_lam 5, H 10": lambda count: [to_rest(random_model(5, seed), 10, count, seed, 10.0) for seed in range(4)],
     "cart-pole, H 30": lambda count: [_cart_pole(30, 0.04, stiffness, count) for stiffness in (10.0, 100.0)],
     "cart-pole, H 50": lambda count: [_cart_pole(50, 0.02, stiffness, count) for stiffness in (10.0, 100.0)],
-    "4 carts": lambda count: [_chain(4, 20, 0.05, 100.0, count), _chain(4, 10, 0.1, 1000.0, count)],
-    "10 carts": lambda count: [_chain(10, 20, 0.1, 100.0, count), _chain(10, 10, 0.1, 1000.0, count)],
+    "4 carts": lambda n: [chain(chain_of_carts(4), 20, n, 24), chain(chain_of_carts(4, 0.1, 1e3), 10, n, 14)],
+    "10 carts": lambda count: [chain(chain_of_carts(10, 0.1, k), h, count, 10 + h) for k, h in ((1e2, 20), (1e3, 10))],
 }

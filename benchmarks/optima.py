@@ -1,9 +1,8 @@
 """Optima that the solver reaches, and their price: `python benchmarks/optima.py [--smoke]`.
 
 The LCS-MPC has local optima. Every effort of the batched backend solves the same problems, cold; the reference is the
-best cost seen by anyone, 32 starts among them. Printed per family and effort: the mean gap to it, the share of problems
-within 0.1 % of it, what failed, and the CPU time as a ratio to `"fast"`: of all problems in one call, and of the first
-few one by one, whose starts lie side by side in the lanes of a vector. Written as JSON too.
+best cost seen by anyone, 32 starts among them. Printed and written per family and effort: the mean gap, the share
+within 0.1 %, what failed, and the CPU time as a ratio to `"fast"`, of all in one call and of the first one by one.
 """
 
 import json

@@ -188,14 +188,6 @@ def start(entries: tuple[Entry, ...], venvs: Path, folder: str) -> list[Process]
 # --- judging ----------------------------------------------------------------------------------------------------------
 
 
-def best_known(problem: Problem, few: slice) -> torch.Tensor:
-    """Compute the objective of our solver from 32 starts, along a long homotopy."""
-    mpc = as_mpc(problem, few)
-    result = BatchedBackend(effort="best", restarts=32, max_iter=600).solve(mpc, None)
-    objective = mpc.objective(result.primal.x, result.primal.u)
-    return torch.where(result.solved, objective, torch.inf)
-
-
 @dataclass
 class Judged:
     """Value of a rival's actions: objective of executing them, and whether they are a certified optimum to 0.1 %."""
@@ -287,7 +279,8 @@ def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> 
     constant = np.broadcast_to(problem.constant, problem.count)[: o.problems]
     reference = np.full(o.problems, np.inf)
     if problem.n_lam:
-        reference = best_known(problem, slice(o.problems)).numpy() + constant
+        ours = BatchedBackend(restarts=32, max_iter=600).solve(as_mpc(problem, slice(o.problems)), None)
+        reference = torch.where(ours.solved, ours.objective, torch.inf).numpy() + constant
     judged = {}
     for label, outcome in best.items():
         if "error" not in outcome:

@@ -49,9 +49,9 @@ constexpr double kRoundingLeft = 1e-9;
 constexpr double kHope = 100.0;
 
 // After this many steps at the target a plan without constraints creeps along the kinks of hard contact. It then goes
-// back to contact softer by these factors, once to each, and follows the homotopy down anew.
-constexpr int64_t kCreeping = 50, kReturns = 3;
-constexpr double kBack[kReturns] = {1e3, 1e4, 1e5};
+// back to contact softer by these factors and follows the homotopy down anew. Much softer contact leads elsewhere.
+constexpr int64_t kCreeping = 50, kReturns = 5;
+constexpr double kBack[kReturns] = {1e1, 1e2, 1e3, 1e4, 1e5};
 
 template <class T>
 struct Progress {

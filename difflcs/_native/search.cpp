@@ -19,12 +19,8 @@ struct Start {
   int64_t explore;              // Newton steps at the target of the homotopy after which it is compared
 };
 
-// The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
-// near where it begins. Neither finds a contact that is far from a plan without it; starts with the largest actions
-// and random pulses do.
-//
-// A start at the target, without a homotopy, needs more steps there before its objective can be compared. In a batch it
-// is then given up more often; for a single problem these steps are free while its first start is under way.
+// The sequence of starts; docs/theory.md says what each may find. A start at the target needs more steps before its
+// objective can be compared. For a single problem these are free while its first start is under way.
 constexpr int64_t kExplore = 2, kExploreFar = 6, kFixed = 4;
 Start start_of(int64_t i) {
   constexpr Start first[] = {{Actions::none, true, false, 1.0, kExplore},
@@ -55,8 +51,7 @@ constexpr double kLonger = 1000.0;
 constexpr int64_t kSoftPulses = 8;
 constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
-// finds is then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan where it
-// begins.
+// finds is then solved at the problem's own, whose kinks keep a plan where it begins.
 constexpr double kSoft = 1e-5, kSofter = 1000.0;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
@@ -67,8 +62,7 @@ constexpr int64_t kAloneForces = 40, kAlone = 48;
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
 // Local search round the best plan of the starts. One round in kRounds makes these shifts: actions of the plan, or of
-// one half of it, come some stages earlier or later. Where contacts are made and broken, an optimum next to a plan
-// touches a stage earlier or later; random starts rarely find that.
+// one half of it, come some stages earlier or later, as do the contacts of an optimum next to a plan.
 struct Shift {
   enum { all, begin, end } part;
   int64_t later;
@@ -76,18 +70,18 @@ struct Shift {
 constexpr int64_t kVaried = 8, kRounds = 4;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
-// The other rounds draw. Half of their variations have a little noise and follow a homotopy from softer contact, ten to
-// the power of kMelted to kMeltedMore times that at which starts are compared. The others are stretched in time, at
-// most by kStretched either way, or push an action for some of the horizon.
+// The other rounds draw. Half of their plans have a little noise, and begin at contact softer by ten to the power of
+// kMelted to kMeltedMore; the others are stretched in time, at most by kStretched, or push an action for a while.
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
 // It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
-// kGain. Once one has, it ends after as many rounds in vain as there are starts: where the best plan of many starts can
-// be improved, there is more to find. Eight times as many rounds are the most. With fewer starts than kVaried there is
-// one, of three shifts and kSoftest, which is solved anew from softer contact; with fewer than kFixed none.
+// kGain. Once one has, there is more to find: it ends after as many rounds in vain as there are starts. Plans of kLong
+// stages get as many again, shorter ones fewer, and half as many at least where one start alone found the plan. Eight
+// times the starts' number are the most. Fewer starts than kVaried have one round, of three shifts and kSoftest, which
+// is solved anew from softer contact; fewer than kFixed none.
 constexpr double kGain = 1e-3;
-constexpr int64_t kFewVaried = 4, kSoftest = kVaried + 1;
+constexpr int64_t kLong = 48, kFewVaried = 4, kSoftest = kVaried + 1;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
@@ -104,10 +98,9 @@ double uniform(uint64_t seed, int64_t start, int64_t position) {
 double power_of_ten(double low, double high, double part) { return std::pow(10.0, low + (high - low) * part); }
 
 // Action `j` of stage `k` in a random pulse, in parts of the way from none to a bound: one way for at most the first
-// kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then
-// stopped so; actions that are random at every stage would cancel each other out. Two starts in a row go opposite ways
-// for as long, and the lengths of pairs are spread by the golden ratio, so that few starts have long ones and short
-// ones. From the second pair on every other one swings to and fro, kSwings to kMoreSwings times: so things bounce.
+// kPush of the horizon, the other way for at most kBrake of it, then none, as a mass that is far is pushed and stopped.
+// Two starts in a row go opposite ways for as long, and the golden ratio spreads the lengths of pairs. From the second
+// pair on every other one swings to and fro, kSwings to kMoreSwings times: so things bounce.
 constexpr double kPush = 0.6, kBrake = 0.4, kLeastPulse = 0.5, kGolden = 0.6180339887498949;
 constexpr double kSwings = 2.0, kMoreSwings = 8.0;
 double pulse(uint64_t seed, int64_t start, int64_t j, int64_t k, int64_t horizon) {
@@ -179,6 +172,13 @@ MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
           b.relaxation * std::max(effort.homotopy, 1.0)};
 }
 
+// `count` problems with the data of these elements.
+MpcBatch part_of(MpcBatch batch, int64_t count, const int64_t* element) {
+  batch.count = count;
+  batch.element = element;
+  return batch;
+}
+
 MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   const Sizes n(b);
   p.x += by * n.x;
@@ -196,15 +196,16 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
 // The objective below which a job must come that is to be better than a plan, by more than kEqual.
 double needed(double objective) { return objective - kEqual * std::abs(objective); }
 
+// How many of `count` starts, which reached these objectives, found one of them.
+int64_t finders(const double* reached, int64_t count, double one) {
+  return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * std::abs(one); });
+}
+
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
-  const double best = *std::min_element(reached, reached + count);
-  const auto near = [](double a, double b) { return std::abs(a - b) <= kEqual * std::abs(b); };
-  int64_t found = 0, lone = 0;
-  for (int64_t i = 0; i < count; i++) {
-    found += near(reached[i], best);
-    lone += std::count_if(reached, reached + count, [&](double v) { return near(v, reached[i]); }) == 1;
-  }
+  const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
+  int64_t lone = 0;
+  for (int64_t i = 0; i < count; i++) lone += finders(reached, count, reached[i]) == 1;
   return found >= std::max(kLeastFound, count / kFound) && lone <= std::max(kMostLone, count / kLone);
 }
 
@@ -247,6 +248,7 @@ void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   best.reserve(batch.count);
   live.reserve(batch.count);
   idle.reserve(batch.count);
+  patience.reserve(batch.count);
   origin.reserve(jobs);
 }
 
@@ -334,9 +336,7 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
 // Runs jobs [first, first + count) to the point where starts are compared.
 void MpcSearch::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                         bool guessed) {
-  MpcBatch jobs = batch;
-  jobs.count = count;
-  jobs.element = tried.element.data() + first;
+  const MpcBatch jobs = part_of(batch, count, tried.element.data() + first);
   MpcSolve o = solver_options(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u;
   o.start = tried.start.data() + first;
@@ -359,9 +359,7 @@ void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
   start.explore = steps;
   tried.start.assign(count, start);
   for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element_of(first + e);
-  MpcBatch jobs = batch;
-  jobs.count = count;
-  jobs.element = tried.element.data();
+  const MpcBatch jobs = part_of(batch, count, tried.element.data());
   MpcSolve o = solver_options(effort, to);
   o.start = tried.start.data();
   if (guess.u) o.u_start = guess.u + first * n.u;
@@ -450,9 +448,7 @@ int64_t MpcSearch::solve_tried(const MpcBatch& batch, const MpcEffort& effort, R
     finished.start[kept] = at_target(batch);
     kept++;
   }
-  MpcBatch jobs = batch;
-  jobs.count = kept;
-  jobs.element = finished.element.data();
+  const MpcBatch jobs = part_of(batch, kept, finished.element.data());
   MpcSolve o = solver_options(effort, finished.plans());
   o.u_start = o.u;
   o.lam_start = o.lam;
@@ -498,8 +494,7 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
       copy_plan(n, tried.plans(), best[e], out, e);
       out.status[e] = int8_t(Status::max_iter);
     } else {
-      MpcBatch elements = batch;
-      elements.element = tried.element.data();
+      const MpcBatch elements = part_of(batch, count, tried.element.data());
       stay_at_start(elements, {guess.u ? guess.u + first * n.u : nullptr, nullptr, nullptr}, out, e);
     }
   }
@@ -581,9 +576,15 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
                         int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool few = effort.starts < kVaried;
-  const int64_t patience = std::max(kRounds, effort.starts);
-  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * patience;
-  idle.assign(count, patience - std::max(kRounds, effort.starts / 4));
+  const int64_t starts = effort.starts, more = starts * std::min(batch.horizon, kLong) / kLong;
+  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * starts;
+  idle.assign(count, 0);
+  patience.assign(count, std::max(kRounds, starts / 4));
+  for (int64_t e : live) {
+    const double* own = reached.data() + e * starts;
+    const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;
+    if (lone) patience[e] = std::max(patience[e], more / 2);
+  }
   const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
@@ -600,7 +601,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
-      vary(batch, effort, kind, round > 0 && idle[e] >= kRounds, out.u + e * n.u, j);
+      vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {
@@ -611,10 +612,14 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       const int64_t e = tried.owner[origin[i]];
       out.iterations[e] += finished.iterations[i];
       if (!solved(finished.status[i]) || !(finished.objective[i] < out.objective[e])) continue;
-      if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) idle[e] = -1;
+      if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) {
+        idle[e] = -1;
+        patience[e] = std::max(kRounds, starts) + more;
+      }
       copy_plan(n, finished.plans(), i, out, e);
     }
-    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= patience; }), live.end());
+    const auto over = [&](int64_t e) { return ++idle[e] >= patience[e]; };
+    live.erase(std::remove_if(live.begin(), live.end(), over), live.end());
   }
 }
 
@@ -635,9 +640,7 @@ void MpcSearch::retry_failed(const MpcBatch& batch, const MpcEffort& effort, con
     tried.element[i] = batch.element_of(origin[i]);
     tried.start[i] = {false, false, 0.0, softer(batch) * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
-  MpcBatch jobs = batch;
-  jobs.count = count;
-  jobs.element = tried.element.data();
+  MpcBatch jobs = part_of(batch, count, tried.element.data());
   jobs.pivot = pivot;
   MpcSolve o = solver_options(effort, tried.plans());
   o.start = tried.start.data();

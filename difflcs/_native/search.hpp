@@ -104,7 +104,7 @@ class MpcSearch {
   Store tried, finished;
   std::vector<double> reached;  // objectives of the starts of each element
   std::vector<int64_t> best;    // of the jobs tried for each element
-  std::vector<int64_t> live, idle;  // elements that are still searched, and for how many rounds without gain
+  std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };
 

@@ -18,9 +18,8 @@ from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, tuple[int, int]] = {"fast": (1, 3), "default": (4, 16), "best": (16, 64)}
-# Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with
-# four starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
-# They get the second of these numbers; where they are easy, their starts agree, and half are enough (search.cpp).
+# Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
+# numbers: with four starts the worst costs 2.7 times the best on a row of four carts, 45 % more on a cart-pole, H 30.
 _MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON = 100, 20, 40
 
 
@@ -52,11 +51,10 @@ class BatchedBackend(Backend):
     contact, along a long homotopy and a short one; the largest actions forth and then back, and back and then forth,
     which find contacts that are far; random pulses, a push and a brake of each action, or swings to and fro. Starts are
     compared after a few steps at the relaxation, or at 1e-5 if that is softer, and only those that may still win are
-    solved to the end; at a harder relaxation the plan that is found is solved once more. The starts of
-    an element lie side by side in the lanes of a vector, so that one problem with four starts takes less than twice as
-    long as with one; a batch pays for each. Half of them, eight for each action, are enough where these agree. A
-    local search follows, unless they agree: the best plan is shifted or stretched in time, pushed, or solved again from
-    softer contact, until that finds nothing better. Of four to seven starts only four of these are tried.
+    solved to the end; at a harder relaxation the plan that is found is solved once more. Half of the starts, eight for
+    each action, are enough where these agree. A local search follows, unless they agree: the best plan is shifted or
+    stretched in time, pushed, or solved again from softer contact, until that finds nothing better, longer for long
+    plans. Of four to seven starts only four of these are tried.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
