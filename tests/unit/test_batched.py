@@ -176,11 +176,9 @@ def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
 def test_a_plan_that_creeps_along_kinks_is_not_lost():
     """These 8 of 192 states have best plans that take over fifty steps at their relaxation."""
     which, known = [167, 129, 132, 89, 11, 191, 160, 58], [5.05, 6.08, 9.94, 6.13, 6.04, 14.54, 10.1, 5.78]
-    lcs = replace(carts(2, 0.05, 0.2, 0.01), c=torch.tensor([1.0, 0.2, 1.0]).double())
-    Q, q = diagonal(0.1, 10.0, 0.01, 0.01), torch.tensor([0.0, -3.0, 0.0, 0.0]).double()
-    mpc = LCSMPCLayer(lcs, QuadraticCost(Q, diagonal(1e-4), 10 * Q, q=q, q_final=10 * q), 50, -2.0, 2.0)
+    mpc = LCSMPCLayer(chain_of_carts(2), push_the_last_cart(2, 50), 50, -2.0, 2.0)
     drawn = 2 * torch.rand(192, 4, generator=torch.Generator().manual_seed(152), dtype=torch.float64) - 1
-    found = 27 + costs(mpc, drawn[which] * torch.tensor([0.3, 0.1, 0.5, 0.2]).double())
+    found = costs(mpc, drawn[which] * torch.tensor([0.3, 0.1, 0.5, 0.2]).double())
     assert int((found <= 1.01 * torch.tensor(known)).sum()) >= 6  # rounding may lead elsewhere
 
 
