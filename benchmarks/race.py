@@ -279,8 +279,10 @@ def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> 
     constant = np.broadcast_to(problem.constant, problem.count)[: o.problems]
     reference = np.full(o.problems, np.inf)
     if problem.n_lam:
-        ours = BatchedBackend(restarts=32, max_iter=600).solve(as_mpc(problem, slice(o.problems)), None)
-        reference = torch.where(ours.solved, ours.objective, torch.inf).numpy() + constant
+        mpc = as_mpc(problem, slice(o.problems))
+        ours = BatchedBackend(restarts=32, max_iter=600).solve(mpc, None)
+        cost = mpc.objective(ours.primal.x, ours.primal.u)
+        reference = torch.where(ours.solved, cost, torch.inf).numpy() + constant
     judged = {}
     for label, outcome in best.items():
         if "error" not in outcome:
