@@ -62,10 +62,8 @@ def test_the_outcome_is_what_a_step_gives(task, env):
         assert not terminated
         assert truncated == (step + 1 == task.episode_steps)
         executed = info.get("executed_action", action)
-        assert task.outcome(before["state"], executed, after["state"], before["goal"], truncated) == (
-            reward,
-            info["success"],
-        )
+        judged = task.outcome(before["state"], executed, after["state"], before["goal"], truncated)
+        assert judged == (reward, info["success"])
         assert {q.name for q in task.errors} <= set(info)
         steps.append((before["state"], executed, after["state"], before["goal"], np.asarray(truncated)))
         before = after

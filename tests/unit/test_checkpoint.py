@@ -150,9 +150,8 @@ def test_log_has_no_doubled_nor_broken_rows(tmp_path):
 @pytest.mark.slow
 def test_a_run_in_use_is_refused_to_another_process(tmp_path):
     """After one that was killed, whose lock is left behind: tests/system/test_reproduce.py."""
-    code = (
-        f"from pathlib import Path; from difflcs import _storage; _storage.locked(Path({str(tmp_path)!r})).__enter__()"
-    )
+    lock = f"_storage.locked(Path({str(tmp_path)!r})).__enter__()"
+    code = f"from pathlib import Path; from difflcs import _storage; {lock}"
     with RunDirectory(tmp_path).locked():
         done = python("-c", code, fails=True)
     assert f"InUseError: {tmp_path}" in done.stderr

@@ -63,10 +63,8 @@ def test_rollouts_stay_within_their_episodes():
 
 def test_a_log_and_its_episodes_are_the_same_transitions():
     random = np.random.default_rng(0)
-    states, actions = (
-        [random.normal(size=(n + 1, 2)) for n in (3, 1, 4)],
-        [random.normal(size=(n, 1)) for n in (3, 1, 4)],
-    )
+    states = [random.normal(size=(n + 1, 2)) for n in (3, 1, 4)]
+    actions = [random.normal(size=(n, 1)) for n in (3, 1, 4)]
     data = Transitions.from_episodes(states, [torch.from_numpy(u) for u in actions])
     assert data.x.shape == (8, 2)
     assert torch.equal(data.x_next[2], torch.from_numpy(states[0][3]))

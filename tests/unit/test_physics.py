@@ -494,10 +494,8 @@ def test_impacts_are_inelastic_whatever_the_step(seconds, compliance, mass):
         system = pushing(drive=drive, compliance=compliance, inertia=Inertia(mass, seconds))
         speed, steps = torch.rand(2, 50, generator=torch.Generator().manual_seed(0), dtype=F64)
         x = torch.zeros(50, system.n_x, dtype=F64)
-        x[:, -3], x[:, 3] = (
-            -0.1 - 3 * speed,
-            -0.04 - 4 * steps * seconds * (0.1 + 3 * speed),
-        )  # within four steps it touches
+        x[:, -3] = -0.1 - 3 * speed
+        x[:, 3] = -0.04 - 4 * steps * seconds * (0.1 + 3 * speed)  # within four steps it touches
         start = x[:, -3].clone()
         for _ in range(25):
             x = system.params(x).step(x, torch.zeros(50, 2, dtype=F64)).x_next

@@ -129,11 +129,8 @@ def test_a_floor_that_nothing_in_the_plane_can_approach_is_left_out():
 
 
 def test_missing_contacts_are_out_of_reach_and_the_nearest_are_kept():
-    balls = "".join(
-        f'<body pos="{x} 0 0"><joint name="s{x}" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>'
-        for x in (0, 1, 3)
-    )
-    model = load(balls)
+    ball = '<body pos="{0} 0 0"><joint name="s{0}" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>'
+    model = load("".join(map(ball.format, (0, 1, 3))))
     x = torch.zeros(6, dtype=torch.float64)
     two = MujocoLCS(model, motion="dynamic", contacts=2, distance=5.0).contacts(x)
     assert sorted(two.gap.tolist()) == pytest.approx([0.8, 1.8])

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSMPCLayer
-from difflcs.errors import InvalidInputError
-from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoCost, MujocoLCS, Posture
+from difflcs.errors import ContactWarning, DTypeError, InvalidInputError, ShapeError
+from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoCost, MujocoLCS, Posture, identify
 from tests.conftest import F64, refuse
 
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
@@ -103,6 +103,31 @@ def test_gradients_are_slopes_of_the_matrices(motion, tolerance):
             ends = torch.tensor([float(total(*at)) for at in moved], dtype=F64)
         slopes = ((ends[::2] - ends[1::2]) / 2e-4).reshape(gradient.shape)
         torch.testing.assert_close(gradient, slopes, rtol=tolerance, atol=1e-9 + tolerance * float(slopes.abs().max()))
+
+
+@pytest.mark.parametrize(("motion", "seconds", "error"), [("dynamic", 0.02, 1e-3), ("quasi-dynamic", 0.1, 0.05)])
+def test_numbers_are_identified_by_mujocos_own_steps(motion, seconds, error):
+    """A finger pushes the cube over the floor."""
+    options, random = OPTIONS | {"motion": motion, "seconds": seconds}, np.random.default_rng(0)
+    learn = ["compliance", "gain", ("mass", "cube")][: 3 if motion == "dynamic" else 2]  # else it slides on
+    learned = LearnableMujocoLCS(model := scene(), learn=learn, **options)
+    with torch.no_grad():
+        learned.change.copy_(torch.tensor([0.1, -0.7, 0.7])[: len(learn)])
+    data, x, u = mujoco.MjData(model), [], []
+    for k in range(41):
+        x.append(learned.state.to_state(data.qpos, data.qvel))
+        data.ctrl[:] = random.uniform(0.0, 0.2) if k % 4 == 0 else data.ctrl
+        u.append(torch.from_numpy(data.ctrl - data.qpos[7:]))
+        mujoco.mj_step(model, data, round(500 * seconds))
+    x, u = torch.stack(x).unfold(0, 4, 1).mT, torch.stack(u[:-1]).unfold(0, 3, 1).mT
+    losses = identify(learned, x, u)
+    assert losses[-1] < losses[0]
+    assert learned.change.tolist() == pytest.approx([0.1, 0.0, 0.0][: len(learn)], abs=error)
+    refuse(ShapeError, "x: expected shape .* one state more", identify, learned, x[..., 1:, :], u)
+    refuse(DTypeError, "module: expected LearnableMujocoLCS", identify, learned.physics, x, u)
+    still = LearnableMujocoLCS(model, learn=[("torsional_friction", "block")], **options)
+    with pytest.warns(ContactWarning, match=r"not depend on torsional_friction block"):
+        identify(still, x, u)
 
 
 def test_a_plan_has_a_gradient():

@@ -27,11 +27,8 @@ def make_cost():
 
 
 def make_layer(model=None, cost=None, **kwargs):
-    limits = (
-        {}
-        if "bounds" in kwargs
-        else {"u_min": torch.full((2,), -0.5).double(), "u_max": torch.full((2,), 0.5).double()}
-    )
+    half = torch.full((2,), 0.5).double()
+    limits = {} if "bounds" in kwargs else {"u_min": -half, "u_max": half}
     return LCSMPCLayer(make_model() if model is None else model, cost or make_cost(), HORIZON, **limits, **kwargs)
 
 
@@ -58,10 +55,6 @@ def assert_as_fresh(layer, *inputs, **kwargs):
     assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))
 
 
-def transpose_data(p):
-    p.data = p.data.T
-
-
 def add_to_one(p):
     p.data[(0,) * (p.ndim - 1) + (-1,) * (p.ndim > 0)] += 0.01
 
@@ -73,7 +66,7 @@ CHANGES = {
     "data that was changed back": lambda p: (p.data.mul_(1.5), p.data.mul_(1 / 1.5)),
     "one number": add_to_one,
     "as an array": lambda p: np.multiply(p.detach().numpy(), 1.5, out=p.detach().numpy()),
-    "transposed": lambda p: transpose_data(p) if p.ndim == 2 and p.shape[0] == p.shape[1] else p.data.mul_(1.5),
+    "transposed": lambda p: setattr(p, "data", p.data.T) if p.ndim == 2 and p.shape == p.mT.shape else p.data.mul_(1.5),
 }
 
 

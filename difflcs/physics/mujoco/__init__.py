@@ -9,6 +9,7 @@ except ImportError as error:
 
 from difflcs.physics.mujoco.cost import Distance, Effort, MujocoCost, Orientation, Position, Posture, Velocity
 from difflcs.physics.mujoco.groups import ContactGroup
+from difflcs.physics.mujoco.identify import identify
 from difflcs.physics.mujoco.lcs import MujocoLCS, lcs_from_mujoco
 from difflcs.physics.mujoco.learnable import LearnableMujocoLCS
 from difflcs.physics.mujoco.mocap import drive_mocap
@@ -27,5 +28,6 @@ __all__ = [
     "Posture",
     "Velocity",
     "drive_mocap",
+    "identify",
     "lcs_from_mujoco",
 ]

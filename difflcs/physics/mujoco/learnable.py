@@ -305,13 +305,13 @@ class _Matrices(Solver):
         found: list[Tensor | None] = []
         for i, (value, needed) in enumerate(zip(plain, needs, strict=True)):
             step = _STATE_STEP if i else _STEP
-            slopes = [_slope(moved(i, j, step), moved(i, j, -step)) / step for j in range(value.shape[-1] * needed)]
+            slopes = [slope(moved(i, j, step), moved(i, j, -step)) / step for j in range(value.shape[-1] * needed)]
             slopes = [slope if i else slope.sum() for slope in slopes]
             found.append(torch.stack(slopes, -1) if slopes else None)
         return found
 
 
-def _slope(ahead: Tensor, behind: Tensor) -> Tensor:
+def slope(ahead: Tensor, behind: Tensor) -> Tensor:
     """The rate of a change by differences to both sides; where a contact comes or goes on one, that of the other."""
     behind = -behind
     smaller = torch.where(ahead.abs() < behind.abs(), ahead, behind)

@@ -5,7 +5,6 @@ them by their rewards acts through it. The planner's objective is that of the LC
 model and in the search.
 """
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,7 @@ from difflcs._checks import check_positive_int
 from difflcs.cost import CostModule, GoalCost, cost_at
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
+from difflcs.rl.learning.trainer import AfterStep, EpisodesReport, EpisodeTrainer
 from difflcs.rl.rollout import (
     CONTEXT,
     PolicyOutput,
@@ -135,29 +134,6 @@ def _quadratic(v: Tensor, matrix: Tensor, vector: Tensor) -> Tensor:
     return (v * (0.5 * (v @ matrix) + vector)).sum(-1)
 
 
-@dataclass(frozen=True)
-class PDDMReport:
-    """Report of one iteration.
-
-    Attributes:
-        iteration: its number, from 1.
-        env_steps: environment steps collected so far.
-        success: share of its episodes that ended at the goal.
-        loss: mean squared error of the standardised changes in the last epoch.
-        unstable: episodes dropped because the simulation broke down.
-        collect_seconds: wall time of the episodes.
-        learn_seconds: wall time of the training.
-    """
-
-    iteration: int
-    env_steps: int
-    success: float
-    loss: float
-    unstable: int
-    collect_seconds: float
-    learn_seconds: float
-
-
 class PDDM(EpisodeTrainer):
     """Trainer of the PDDM baseline, see `Trainer`.
 
@@ -191,20 +167,18 @@ class PDDM(EpisodeTrainer):
         super().__init__(self.ensemble, planner, seed, episode_steps, env, needed)
         self.settings, self.total_episodes = settings, total_episodes
 
-    def step(self, after_step: AfterStep | None = None) -> PDDMReport:
+    def step(self, after_step: AfterStep | None = None) -> EpisodesReport:
         """One iteration: collect, then fit the ensemble to all data."""
         settings, first = self.settings, self.iteration == 0
         wanted = settings.rollouts.first if first else settings.rollouts.each
         count = min(wanted, self.total_episodes - self.episodes)
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
-        start = time.perf_counter()
         if first:
             act = uniform_actions(self.env, np.random.default_rng((self.seed, Stream.ACTION)))
         else:
             act = mpc_actions(self.policy, seed=number(self.seed, Stream.PLAN, self.iteration, 0))
-        episodes = self.collect(act, count, after_step)
-        collected = time.perf_counter()
+        self.collect(act, count, after_step)
         if not settings.keep_networks:
             self.ensemble.draw(generator(self.seed, Stream.FIT, self.iteration, 0))
         loss = self.ensemble.fit(
@@ -214,13 +188,4 @@ class PDDM(EpisodeTrainer):
             learning_rate=settings.ensemble.learning_rate,
             generator=generator(self.seed, Stream.FIT, self.iteration, 1),
         )
-        self.iteration += 1
-        return PDDMReport(
-            iteration=self.iteration,
-            env_steps=self.env_steps,
-            success=float(episodes["success"].double().mean()),
-            loss=loss,
-            unstable=int((~episodes["stable"]).sum()),
-            collect_seconds=collected - start,
-            learn_seconds=time.perf_counter() - collected,
-        )
+        return self.report(EpisodesReport, loss)

@@ -5,8 +5,7 @@ Its episodes, with some noise, are the data; the few numbers of the physics are 
 episodes are better. A main phase may follow: PPO through the MPC (Algorithm 2), as in LCS-RL.
 """
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,16 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from difflcs._checks import check_kind
 from difflcs.errors import InvalidInputError
 from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
-from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
-from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions
+from difflcs.rl.learning.trainer import AfterStep, EpisodesReport, EpisodeTrainer
+from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions, uniform_actions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
+from difflcs.scales import Scales
 
 # Xi of the violation loss. From 0.001 to 0.2 made no difference to the sugar box: .975, .970 and .980 of 200 goals.
 _XI = 0.02
@@ -37,87 +38,35 @@ class PhysicsFitSettings(Settings):
     """Standard deviation [units of the action] of the Gaussian noise on executed actions."""
     steps: int = bounded(60, minimum=1)
     """Steps of Adam per iteration, on the data of the whole training."""
-    batch: int | None = bounded(None, minimum=1)
-    """Transitions per step, drawn anew for each; None: all. A MuJoCo system takes 5 to 10 ms per transition."""
     learning_rate: float = bounded(0.02, above=0)
     """Step size of Adam, which begins anew in each iteration."""
-    last_rate: float = bounded(1.0, above=0, maximum=1)
-    """Fraction of it at the end of an iteration, to which it falls linearly."""
-    explained: float | None = bounded(None, above=0, maximum=1)
-    """Share of transitions that count by their loss, the others by its logarithm, so that impacts do not dominate;
-    None: all count by their loss."""
+    simulated: int | None = bounded(None, minimum=1)
+    """Transitions of a MuJoCo model to which its own steps are fitted (`identify`), drawn from all in each iteration;
+    None: the violation loss of all."""
+    window: int = bounded(6, minimum=1)
+    """Actions of each motion that is simulated."""
+    random: int = bounded(0, minimum=0)
+    """First iterations whose actions are uniformly random, instead of the MPC's."""
 
 
 def physics_loss(
-    lcs: LCSModule,
-    x: Tensor,
-    u: Tensor,
-    x_next: Tensor,
-    scale: Tensor,
-    explained: float | None = None,
-    context: Tensor | None = None,
+    lcs: LCSModule, x: Tensor, u: Tensor, x_next: Tensor, scale: Tensor, context: Tensor | None = None
 ) -> Tensor:
-    """Compute the loss of transitions of a system that depends on the state.
-
-    Args:
-        lcs: the module.
-        x: (N, n_x) states.
-        u: (N, n_u) actions.
-        x_next: (N, n_x) next states.
-        scale: (n_x,) units in which errors of the states count.
-        explained: see `PhysicsFitSettings`.
-        context: (N, n_context) or None.
-
-    Returns:
-        Scalar: the mean violation loss in units of `scale`; with `explained` a mean between the geometric and the
-        arithmetic one.
-    """
-    system: Any = system_at(lcs, x, context)
-    losses = violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI, reduction="none")
-    if explained is None:
-        return losses.mean()
-    usual = losses.detach().quantile(explained).clamp(min=1e-12)
-    return usual * (losses / usual).log1p().mean().expm1()
-
-
-def _in_units(system: LCSParams, scale: Tensor) -> LCSParams:
-    """Express a system in states x/scale."""
-    column = scale.unsqueeze(-1)
-    return replace(
-        system,
-        A=system.A * scale / column,
-        B=system.B / column,
-        C=system.C / column,
-        d=system.d / scale,
-        D=system.D * scale,
-    )
+    """Compute the mean violation loss of x (N, n_x), u (N, n_u), x_next (N, n_x), in units `scale` (n_x,) of states."""
+    units = Scales(torch.zeros_like(scale), 1 / scale, torch.ones_like(u[0]), 1.0, 1.0)
+    system = units.params(check_kind("params", system_at(lcs, x, context), LCSParams))
+    return violation_loss(system, x / scale, u, x_next / scale, "auto", _XI)
 
 
 @dataclass(frozen=True)
-class PhysicsFitReport:
-    """Report of one iteration.
+class PhysicsFitReport(EpisodesReport):
+    """Report of one iteration, whose loss is that before the last step of the fit; see `identify` for simulated motion.
 
     Attributes:
-        iteration: its number, from 1.
-        env_steps: environment steps collected so far.
-        success: share of its episodes that ended at the goal, under noise.
-        loss: before the last step of the fit.
-        first_loss: before its first step, on the same data, or on another batch of it.
-        solver_failures: MPC solves that did not converge.
-        unstable: episodes dropped because the simulation broke down.
-        collect_seconds: wall time of the episodes.
-        learn_seconds: wall time of the fit.
+        first_loss: before its first step, on the same data.
     """
 
-    iteration: int
-    env_steps: int
-    success: float
-    loss: float
     first_loss: float
-    solver_failures: int
-    unstable: int
-    collect_seconds: float
-    learn_seconds: float
 
 
 class PhysicsFit(EpisodeTrainer):
@@ -151,8 +100,8 @@ class PhysicsFit(EpisodeTrainer):
     ):
         needed = min(settings.rollouts, total_episodes)
         super().__init__(check_module(lcs, env), policy, seed, episode_steps, env, needed)
-        self.lcs, self.settings = lcs, settings
-        self.scale, self.total_episodes = scale, total_episodes
+        self.lcs: Any = lcs
+        self.settings, self.scale, self.total_episodes = settings, scale, total_episodes
 
     def step(self, after_step: AfterStep | None = None) -> PhysicsFitReport:
         """One iteration: collect, then fit.
@@ -160,46 +109,39 @@ class PhysicsFit(EpisodeTrainer):
         Raises:
             InvalidInputError: all episodes are collected.
         """
-        start = time.perf_counter()
         count = min(self.settings.rollouts, self.total_episodes - self.episodes)
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
         noise = np.random.default_rng((self.seed, Stream.ACTION, self.iteration))
-        act = noisy_actions(mpc_actions(self.policy), self.settings.noise, noise)
-        episodes = self.collect(act, count, after_step)
-        collected = time.perf_counter()
-        losses = self._fit()
-        self.iteration += 1
-        return PhysicsFitReport(
-            iteration=self.iteration,
-            env_steps=self.env_steps,
-            success=float(episodes["success"].double().mean()),
-            loss=losses[-1],
-            first_loss=losses[0],
-            solver_failures=int(episodes["failures"].sum()),
-            unstable=int((~episodes["stable"]).sum()),
-            collect_seconds=collected - start,
-            learn_seconds=time.perf_counter() - collected,
-        )
+        if self.iteration < self.settings.random:
+            act = uniform_actions(self.env, noise)
+        else:
+            act = noisy_actions(mpc_actions(self.policy), self.settings.noise, noise)
+        self.collect(act, count, after_step)
+        losses = self._fit() if self.settings.simulated is None else self._identify(self.settings.simulated)
+        return self.report(PhysicsFitReport, losses[-1], first_loss=losses[0])
 
     def _fit(self) -> list[float]:
-        module: Any = self.lcs
-        learned = [p for p in module.parameters() if p.requires_grad]
+        learned = [p for p in self.lcs.parameters() if p.requires_grad]
         adam = torch.optim.Adam(learned, self.settings.learning_rate)
-        slower = torch.optim.lr_scheduler.LinearLR(adam, 1.0, self.settings.last_rate, self.settings.steps)
-        data, context, losses = transitions(self.buffer), contexts(self.buffer), []
-        random = np.random.default_rng((self.seed, Stream.MINIBATCH, self.iteration))
-        size = min(self.settings.batch or len(data[0]), len(data[0]))
+        x, u, x_next = transitions(self.buffer)
+        context, losses = contexts(self.buffer), []
         for _ in range(self.settings.steps):
-            chosen = torch.from_numpy(np.sort(random.choice(len(data[0]), size, replace=False)))
-            x, u, x_next = (part[chosen] for part in data)
-            known = None if context is None else context[chosen]
-            loss = physics_loss(self.lcs, x, u, x_next, self.scale, self.settings.explained, known)
+            loss = physics_loss(self.lcs, x, u, x_next, self.scale, context)
             check_depends(loss)
             adam.zero_grad()
             loss.backward()
             if all(bool(torch.isfinite(p.grad).all()) for p in learned if p.grad is not None):
                 adam.step()
-            slower.step()
             losses.append(float(loss.detach()))
         return losses
+
+    def _identify(self, simulated: int) -> list[float]:
+        from difflcs.physics.mujoco import identify  # MuJoCo need not be installed
+
+        states, actions = self.buffer["state"], self.buffer["action"]
+        window = min(self.settings.window, actions.shape[1])
+        x, u = states.unfold(1, window + 1, 1).mT.flatten(0, 1), actions.unfold(1, window, 1).mT.flatten(0, 1)
+        random = np.random.default_rng((self.seed, Stream.MINIBATCH, self.iteration))
+        chosen = random.choice(len(x), min(len(x), max(1, simulated // window)), replace=False)
+        return identify(self.lcs, x[chosen], u[chosen])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +30,6 @@ from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
-    from tensordict import TensorDict
 
 AfterStep = Callable[[int], object]
 """Called after every step of the environments with the number of episodes that were stepped, for progress bars."""
@@ -85,6 +86,31 @@ class Trainer(ABC):
         restore(self, state)
 
 
+@dataclass(frozen=True)
+class EpisodesReport:
+    """Report of one iteration that collects episodes and learns from them.
+
+    Attributes:
+        iteration: its number, from 1.
+        env_steps: environment steps collected so far.
+        success: share of its episodes that ended at the goal, with all noise and limits of collecting.
+        loss: of what is learned, at the end.
+        solver_failures: MPC solves that did not converge.
+        unstable: episodes dropped because the simulation broke down.
+        collect_seconds: wall time of the episodes.
+        learn_seconds: wall time of learning.
+    """
+
+    iteration: int
+    env_steps: int
+    success: float
+    loss: float
+    solver_failures: int
+    unstable: int
+    collect_seconds: float
+    learn_seconds: float
+
+
 class EpisodeTrainer(Trainer):
     """Base of trainers that collect episodes and learn from those that they keep.
 
@@ -105,14 +131,30 @@ class EpisodeTrainer(Trainer):
         self.buffer = make_empty_record(env, episode_steps)
         """Episodes to learn from."""
 
-    def collect(self, act: Act, count: int, after_step: AfterStep | None, kept: int | None = None) -> TensorDict:
+    def collect(self, act: Act, count: int, after_step: AfterStep | None, kept: int | None = None) -> None:
         """Collect the next episodes of the training; the buffer then holds the newest `kept`, all if None."""
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
-        report = None if after_step is None else lambda: after_step(count)
-        episodes = collect(self.env, act, seeds, self.episode_steps, report)
+        report, start = None if after_step is None else lambda: after_step(count), time.perf_counter()
+        self._newest = collect(self.env, act, seeds, self.episode_steps, report)
+        self._times = start, time.perf_counter()
         self.episodes += count
-        self.buffer = append_episodes(self.buffer, episodes, kept)
-        return episodes
+        self.buffer = append_episodes(self.buffer, self._newest, kept)
+
+    def report(self, kind: type[EpisodesReport], loss: float, **more: Any) -> Any:
+        """End an iteration that has learned from the newest episodes: make its report, with `more` of its fields."""
+        self.iteration += 1
+        start, collected = self._times
+        return kind(
+            iteration=self.iteration,
+            env_steps=self.env_steps,
+            success=float(self._newest["success"].double().mean()),
+            loss=loss,
+            solver_failures=int(self._newest["failures"].sum()),
+            unstable=int((~self._newest["stable"]).sum()),
+            collect_seconds=collected - start,
+            learn_seconds=time.perf_counter() - collected,
+            **more,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""

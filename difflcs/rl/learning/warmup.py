@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +14,13 @@ from difflcs.losses import violation_loss
 from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state_tree import State
-from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
+from difflcs.rl.learning.trainer import AfterStep, EpisodesReport, EpisodeTrainer
 from difflcs.rl.rollout import Policy, action_bounds, contexts, mpc_actions, noisy_actions, transitions, uniform_actions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
-    from tensordict import TensorDict
 
 _ADAM_EPS = 1e-6
 HELD_OUT = 0.2
@@ -154,34 +152,18 @@ def fit(
 
 
 @dataclass(frozen=True)
-class WarmupReport:
-    """Report of one iteration.
+class WarmupReport(EpisodesReport):
+    """Report of one iteration, whose actions are within the action support.
 
     Attributes:
-        iteration: its number, from 1.
-        env_steps: environment steps collected so far.
-        success: share of its episodes that ended at the goal, under noise and within the action support.
-        loss: see `Fit`.
         held_out_loss: see `Fit`.
         gradient_steps: in this iteration.
         support_width: mean width of the action bounds [units of the action].
-        solver_failures: MPC solves that did not converge.
-        unstable: episodes dropped because the simulation broke down.
-        collect_seconds: wall time of the episodes.
-        learn_seconds: wall time of the training call.
     """
 
-    iteration: int
-    env_steps: int
-    success: float
-    loss: float
     held_out_loss: float | None
     gradient_steps: int
     support_width: float
-    solver_failures: int
-    unstable: int
-    collect_seconds: float
-    learn_seconds: float
 
 
 class Warmup(EpisodeTrainer):
@@ -227,9 +209,7 @@ class Warmup(EpisodeTrainer):
 
     def step(self, after_step: AfterStep | None = None) -> WarmupReport:
         """One iteration: collect, then learn."""
-        start = time.perf_counter()
-        episodes = self._collect(after_step)
-        collected = time.perf_counter()
+        self._collect(after_step)
         if isinstance(self.lcs, LCSModel) and self.lcs.action_support is not None:
             self.lcs.action_support.copy_(torch.stack(self.bounds))
         data, context = transitions(self.buffer), contexts(self.buffer)
@@ -239,22 +219,11 @@ class Warmup(EpisodeTrainer):
         first = (not known and take_frame(*data)) or (self.iteration == 0 and not self.pretrained)
         epochs = self.settings.epochs.first if first else self.settings.epochs.each
         outcome = fit(self.lcs, *data, self.settings, epochs, self._minibatches, context=context)
-        self.iteration += 1
-        return WarmupReport(
-            iteration=self.iteration,
-            env_steps=self.env_steps,
-            success=float(episodes["success"].double().mean()),
-            loss=outcome.loss,
-            held_out_loss=outcome.held_out_loss,
-            gradient_steps=outcome.steps,
-            support_width=float((self.bounds[1] - self.bounds[0]).mean()),
-            solver_failures=int(episodes["failures"].sum()),
-            unstable=int((~episodes["stable"]).sum()),
-            collect_seconds=collected - start,
-            learn_seconds=time.perf_counter() - collected,
-        )
+        width = float((self.bounds[1] - self.bounds[0]).mean())
+        more = {"held_out_loss": outcome.held_out_loss, "gradient_steps": outcome.steps, "support_width": width}
+        return self.report(WarmupReport, outcome.loss, **more)
 
-    def _collect(self, after_step: AfterStep | None) -> TensorDict:
+    def _collect(self, after_step: AfterStep | None) -> None:
         settings = self.settings
         random = self.iteration == 0 and not self.pretrained
         count = settings.rollouts.first if random else settings.rollouts.each
@@ -265,7 +234,7 @@ class Warmup(EpisodeTrainer):
                 scale = settings.action_support * settings.action_support_growth ** (self.iteration - 1)
                 self.bounds = action_support(self.buffer["action"], scale, self.low, self.high)
             act = noisy_actions(mpc_actions(self.policy, *self.bounds), settings.noise, self._actions)
-        return self.collect(act, count, after_step, settings.buffer)
+        self.collect(act, count, after_step, settings.buffer)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""

@@ -40,7 +40,7 @@ class ContactMethod(Method):
     """MPC solver: batched, or ipopt, the reference."""
 
     name: ClassVar[str] = "contact-lcs"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     summary: ClassVar[str] = "known contacts whose physics is fitted, then PPO through the MPC; told the outline"
     reports: ClassVar[tuple[type, ...]] = (PhysicsFitReport, PPOReport)
     kind: ClassVar[str] = "physics"

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from difflcs._checks import describe
-from difflcs.errors import InvalidInputError
+from difflcs._checks import check_kind
 from difflcs.rl.learning.physics_fit import PhysicsFitSettings
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods.base import Work
@@ -14,29 +13,19 @@ from difflcs.rl.settings import group
 
 @dataclass(frozen=True)
 class MujocoMethod(ContactMethod):
-    """LCS-RL with a MuJoCo model inside: masses, friction or drives are fitted to the MPC's own episodes, then PPO."""
+    """LCS-RL with a MuJoCo model inside, whose own steps are fitted to the MPC's episodes; then PPO."""
 
-    fit: PhysicsFitSettings = group(
-        PhysicsFitSettings, rollouts=4, learning_rate=0.1, last_rate=0.1, batch=50, explained=0.3
-    )
+    fit: PhysicsFitSettings = group(PhysicsFitSettings, rollouts=4, simulated=240)
     """Settings of the fit."""
 
     name: ClassVar[str] = "mujoco-lcs"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     summary: ClassVar[str] = "a MuJoCo model whose uncertain numbers are fitted, then PPO through the MPC"
 
     def trainer(self, work: Work) -> Trainer:
-        """See `Method`.
-
-        Raises:
-            InvalidInputError: the task has no MuJoCo model that can be learned.
-        """
+        """See `Method`; a DTypeError where the task has no MuJoCo model that can be learned."""
         from difflcs.physics.mujoco import LearnableMujocoLCS  # MuJoCo need not be installed
 
         system = known_physics(work.task).make_system()
-        if not isinstance(system, LearnableMujocoLCS):
-            raise InvalidInputError(
-                f"task: expected a PhysicsSpec that makes a LearnableMujocoLCS for {self.name}, got "
-                f"{describe(system)}; use contact-lcs for other physics"
-            )
+        check_kind("task.physics.make_system()", system, LearnableMujocoLCS, "use contact-lcs for other physics")
         return super().trainer(work)

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.dynamics import Ensemble
-from difflcs.rl.learning.pddm import PDDM, PDDMReport, PDDMSettings, Planner
+from difflcs.rl.learning.pddm import PDDM, PDDMSettings, Planner
+from difflcs.rl.learning.trainer import EpisodesReport
 from difflcs.rl.methods.base import Method, Work
 from difflcs.rl.settings import group
 from difflcs.rl.tasks import TaskSpec
@@ -24,7 +25,7 @@ class PDDMMethod(Method):
     name: ClassVar[str] = "pddm"
     version: ClassVar[int] = 2
     summary: ClassVar[str] = "PDDM: networks, and a planner that samples actions"
-    reports: ClassVar[tuple[type, ...]] = (PDDMReport,)
+    reports: ClassVar[tuple[type, ...]] = (EpisodesReport,)
     kind: ClassVar[str] = "dynamics"
 
     def trainer(self, work: Work) -> PDDM:

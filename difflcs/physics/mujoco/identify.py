@@ -1,0 +1,118 @@
+"""Numbers of a MuJoCo model from its motion: least squares between what was observed and MuJoCo's own steps."""
+
+import warnings
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from difflcs._checks import check_kind, check_positive_int, check_shape
+from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.physics.mujoco.learnable import LearnableMujocoLCS, slope
+from difflcs.physics.mujoco.native import to_numpy
+
+_REACH, _LEAST = 0.3, 4e-3  # over which differences are taken: at first, and when it is done
+_LONGEST = 1.0  # step of a parameter; they are of size 1
+_FLOOR = 0.01  # least error of a number of the state, in parts of its mean motion in a step, that counts
+_LEAD = 2  # actions that bring about the velocities of states without any
+_USER = mujoco.mjtState.mjSTATE_USER
+
+
+def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int = 20) -> list[float]:
+    """Fit the parameters of a module to observed motion, by MuJoCo's own steps of the model that is learned.
+
+    Each motion is simulated from its first state with the controls that were executed. Gauss–Newton steps make the sum
+    of log(1 + (e/s)²) small, over all numbers of all states, with s the median error of a number: neither impacts nor
+    other joints outweigh what a push tells (iteratively reweighted least squares with Cauchy's weights). Derivatives
+    are differences over the length of the last step, and what changes by more than it errs over that length counts
+    less. The compliance stays as it is, as it is not MuJoCo's.
+
+    Args:
+        module: the model, changed in place. Bodies that mocap moves, and applied forces, are as in its data.
+        x: (..., H + 1, n_x) observed states. Where states have no velocities, the first two actions bring these about,
+            from rest: they begin at the observed places, and what they lead to does not count, so H is 3 or more.
+        u: (..., H, n_u) actions, which `MujocoLCS.control` converts to controls at the observed states.
+        iterations: most steps, of two simulations for each parameter and one to three more.
+
+    Returns:
+        The mean of log(1 + (e/m)²) before each step, where m is the mean motion of a number of the state in a step.
+
+    Raises:
+        InvalidInputError and its kinds: the arguments do not fit, or MuJoCo gives warnings in most of the motions.
+
+    Warns:
+        ContactWarning: the motion does not depend on one of the parameters.
+    """
+    check_kind("module", module, LearnableMujocoLCS, "learn others by violation_loss")
+    state, lead = module.state, 0 if module.state.velocities else _LEAD
+    check_shape("u", u, f"... {lead + 1}+ n_u", {"n_u": module.n_u}, "take longer motions")
+    check_shape("x", x, "... H n_x", {"H": u.shape[-2] + 1, "n_x": module.n_x}, "one state more than actions")
+    ctrl = to_numpy(module.control(x[..., :-1, :], u)).reshape(-1, *u.shape[-2:])
+    begin = state.flatten(x, module._data.act).reshape(len(ctrl), u.shape[-2] + 1, -1)
+    seen = state.to_state(*np.split(begin, [state.nq, state.nq + state.nv], -1))  # no rotation beyond half a turn
+    usual, seen = (seen[:, 1:] - seen[:, :-1]).abs().mean((0, 1)).clamp_min(1e-12), seen[:, 1 + lead :]
+
+    def miss(change: Tensor) -> tuple[Tensor, int]:
+        after, broken = _simulate(module, change, begin, ctrl, lead)
+        return after - seen, broken
+
+    learned = {s + k: f"{kind} {name}" for kind, name, ids, s, n in module._entries for k in range(n) if ids}
+    at, reach, losses = module.change.detach().clone(), _REACH, []
+    ways, (missed, broken) = torch.eye(len(at), dtype=at.dtype)[list(learned)], miss(at)
+    if 2 * broken > len(begin):
+        raise InvalidInputError(
+            f"x, u: expected motions that MuJoCo can simulate, got warnings of it in {broken} of {len(begin)}; see "
+            f"MUJOCO_LOG.TXT, take shorter ones, or begin with a better guess"
+        )
+    while len(losses) < check_positive_int("iterations", iterations) and reach > _LEAST:
+        losses.append(float((missed / usual).square().log1p().mean()))
+        scale = missed.abs().flatten(0, 1).median(0).values + _FLOOR * usual
+        errors = missed / scale
+        ends = [[(miss(at + sign * reach * way)[0] - missed) / scale for sign in (1, -1)] for way in ways]
+        J = torch.stack([slope(*both) for both in ends], -1) / reach
+        if len(losses) == 1 and (
+            silent := [n for n, j in zip(learned.values(), J.unbind(-1), strict=True) if not j.any()]
+        ):
+            said = f"the motion does not depend on {', '.join(silent)}, which stay as guessed; observe what shows them"
+            warnings.warn(said, ContactWarning, stacklevel=2)
+        weighted = J / (1 + errors.square() + (reach * J).square().sum(-1)).unsqueeze(-1)
+        A = torch.einsum("nti...,ntij->...j", J, weighted)
+        step = torch.linalg.solve(A + (1e-6 * A.diag() + 1e-9).diag(), -torch.einsum("ntij,nti->j", weighted, errors))
+        step = step @ ways / max(1.0, float(step.abs().max()) / _LONGEST)
+        least, start = errors.square().log1p().mean(), at
+        for length in (1, 2, 4):
+            other, _ = miss(start + length * step)
+            if not (value := (other / scale).square().log1p().mean()) < least:
+                break
+            least, missed, at = value, other, start + length * step
+        reach = min(_REACH, max(float((at - start).abs().max()), reach / 3))
+    with torch.no_grad():
+        module.change.copy_(at)
+    return losses
+
+
+def _simulate(
+    module: LearnableMujocoLCS, change: Tensor, begin: NDArray[np.float64], ctrl: NDArray[np.float64], lead: int
+) -> tuple[Tensor, int]:
+    """Simulate from `begin` (n, H + 1, nq + nv + na) by controls (n, H, nu).
+
+    Returns:
+        States (n, H − lead, n_x), and in how many motions MuJoCo gave a warning, after which they stand still.
+    """
+    model, seconds = module._changed(to_numpy(change)), module.physics.seconds
+    count = max(1, round(seconds / model.opt.timestep))
+    model.opt.timestep = seconds / count
+    given = np.zeros(mujoco.mj_stateSize(model, _USER))
+    mujoco.mj_getState(model, module._data, given, _USER)
+    held = np.concatenate([ctrl, np.broadcast_to(given[model.nu :], (*ctrl.shape[:2], len(given) - model.nu))], -1)
+    threads, after = [mujoco.MjData(model) for _ in range(torch.get_num_threads())], begin[:, :1]
+    for k in range(lead + 1):  # at the places that were observed
+        first = np.concatenate([np.zeros((len(begin), 1)), begin[:, k, : model.nq], after[:, -1, model.nq :]], -1)
+        actions = held[:, k : k + 1 if k < lead else None].repeat(count, 1)
+        states, _ = mujoco.rollout.rollout(model, threads, first, actions, control_spec=int(_USER))
+        after = states[:, count - 1 :: count, 1:]
+    broken = int((states[:, -1, 0] < (actions.shape[1] - 0.5) * model.opt.timestep).sum())  # where time has stopped
+    return module.state.to_state(*np.split(after, [model.nq, model.nq + model.nv], -1)), broken
