@@ -416,7 +416,13 @@ def test_bootstrap_against_numbers_by_hand():
     assert found.high - found.low == pytest.approx(2 * 1.96 * many.std() / 20, rel=0.1)
 
 
-def test_p_value_against_numbers_by_hand():
+def test_p_value_against_scipy():
+    from scipy.stats import permutation_test
+
+    for seeds in (4, 7, 10):
+        apart = np.random.default_rng(seeds).normal(0.6, 1.0, seeds)
+        theirs = permutation_test((apart,), np.mean, permutation_type="samples", n_resamples=np.inf)
+        assert stats.p_value(apart) == pytest.approx(theirs.pvalue)
     assert stats.p_value([1.0, 2.0, 3.0]) == 0.25  # two of eight choices of signs
     assert stats.p_value([0.0, 0.0]) == 1.0
     assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.5  # but for rounding the same

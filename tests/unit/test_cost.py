@@ -33,11 +33,8 @@ def paper(x, u, goal):
             + 200.0 * float(u.square().sum())
         )
 
-    final = (
-        near(x[-1], 6.0)
-        + 200.0 * float((x[-1, :2] - goal[:2]).square().sum())
-        + 1.5 * float((x[-1, 2] - goal[2]).square())
-    )
+    aim = 200.0 * float((x[-1, :2] - goal[:2]).square().sum()) + 1.5 * float((x[-1, 2] - goal[2]).square())
+    final = near(x[-1], 6.0) + aim
     return sum(stage(x[k], u[k]) for k in range(len(u))) + final
 
 

@@ -46,10 +46,8 @@ def test_with_an_exact_model_only_the_first_steps_are_lost(steps):
 
 def test_evaluation_with_delay():
     policy = Reach()
-    on_time, late, predicted = (
-        evaluate(make_envs(4), policy, 4, 0, STEPS, delay=delay, model=model)
-        for delay, model in ((0, None), (2, None), (2, pusher()))
-    )
+    cases = (0, None), (2, None), (2, pusher())
+    on_time, late, predicted = (evaluate(make_envs(4), policy, 4, 0, STEPS, delay=d, model=m) for d, m in cases)
     assert late.median_errors["position_error"] != on_time.median_errors["position_error"]
     assert late.median_errors["position_error"] != predicted.median_errors["position_error"]
     refuse(InvalidInputError, "delay", evaluate, make_envs(4), policy, 4, 0, STEPS, delay=-1)

@@ -316,10 +316,9 @@ def test_mobility_by_damping_or_by_numbers():
 
 @pytest.mark.parametrize("bias", ["40 -400 -40", "0 -400 -40"])
 def test_a_servo_with_a_constant_force_goes_where_it_is_told(bias):
-    model = load(
-        '<body><joint name="a" type="slide" axis="1 0 0"/><geom size=".05" mass="1"/></body>',
-        f'<actuator><general joint="a" gear="2" gainprm="400" biastype="affine" biasprm="{bias}"/></actuator>',
-    )
+    body = '<body><joint name="a" type="slide" axis="1 0 0"/><geom size=".05" mass="1"/></body>'
+    servo = f'<general joint="a" gear="2" gainprm="400" biastype="affine" biasprm="{bias}"/>'
+    model = load(body, f"<actuator>{servo}</actuator>")
     ctrl = MujocoLCS(model).control(tensor(0.01), tensor(0.05))
     after, _ = step(model, 0.01, ctrl=ctrl.numpy(), seconds=2.0)
     np.testing.assert_allclose(after, 0.06, atol=1e-5)

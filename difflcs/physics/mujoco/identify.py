@@ -15,7 +15,6 @@ from difflcs.physics.mujoco.learnable import LearnableMujocoLCS, slope
 from difflcs.physics.mujoco.native import to_numpy
 
 _REACH, _LEAST = 0.3, 4e-3  # over which differences are taken: at first, and when it is done
-_LONGEST = 1.0  # step of a parameter; they are of size 1
 _FLOOR = 0.01  # least error of a number of the state, in parts of its mean motion in a step, that counts
 _LEAD = 2  # actions that bring about the velocities of states without any
 _USER = mujoco.mjtState.mjSTATE_USER
@@ -81,7 +80,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
         weighted = J / (1 + errors.square() + (reach * J).square().sum(-1)).unsqueeze(-1)
         A = torch.einsum("nti...,ntij->...j", J, weighted)
         step = torch.linalg.solve(A + (1e-6 * A.diag() + 1e-9).diag(), -torch.einsum("ntij,nti->j", weighted, errors))
-        step = step @ ways / max(1.0, float(step.abs().max()) / _LONGEST)
+        step = step @ ways / max(1.0, float(step.abs().max()))  # parameters are of size 1
         least, start = errors.square().log1p().mean(), at
         for length in (1, 2, 4):
             other, _ = miss(start + length * step)
