@@ -141,9 +141,8 @@ def guess_rail():
 def test_a_mujoco_model_is_fitted_to_the_episodes_of_its_mpc(simulated):
     physics = PhysicsSpec(make_system=guess_rail, scale=(0.01, 0.2), relaxation=1e-3)
     task = make_task(env=Rail, physics=physics)
-    fit = PhysicsFitSettings(rollouts=4, noise=0.1, steps=25, learning_rate=0.1)
-    if simulated:  # motion by random actions
-        fit = PhysicsFitSettings(rollouts=4, simulated=simulated, random=1)
+    how = {"simulated": simulated, "random": 1} if simulated else {"noise": 0.1, "steps": 25, "learning_rate": 0.1}
+    fit = PhysicsFitSettings(rollouts=4, **how)
     trainer = MujocoMethod(fit=fit).trainer(Work(task, 0, 8, task.make_envs))
     for _ in range(2):
         trainer.step()

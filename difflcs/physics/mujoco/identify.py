@@ -6,12 +6,11 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import check_kind, check_positive_int, check_shape
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco.learnable import LearnableMujocoLCS, slope
+from difflcs.physics.mujoco.learnable import Array, LearnableMujocoLCS, slope
 from difflcs.physics.mujoco.native import to_numpy
 
 _REACH, _LEAST = 0.3, 4e-3  # over which differences are taken: at first, and when it is done
@@ -93,9 +92,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
     return losses
 
 
-def _simulate(
-    module: LearnableMujocoLCS, change: Tensor, begin: NDArray[np.float64], ctrl: NDArray[np.float64], lead: int
-) -> tuple[Tensor, int]:
+def _simulate(module: LearnableMujocoLCS, change: Tensor, begin: Array, ctrl: Array, lead: int) -> tuple[Tensor, int]:
     """Simulate from `begin` (n, H + 1, nq + nv + na) by controls (n, H, nu).
 
     Returns:

@@ -104,11 +104,7 @@ class PhysicsFit(EpisodeTrainer):
         self.settings, self.scale, self.total_episodes = settings, scale, total_episodes
 
     def step(self, after_step: AfterStep | None = None) -> PhysicsFitReport:
-        """One iteration: collect, then fit.
-
-        Raises:
-            InvalidInputError: all episodes are collected.
-        """
+        """One iteration: collect, then fit; an InvalidInputError where all episodes are collected."""
         count = min(self.settings.rollouts, self.total_episodes - self.episodes)
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
