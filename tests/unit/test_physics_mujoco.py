@@ -424,6 +424,13 @@ RESTS = {
     "no compliance": (SERVOS, {"compliance": 0.0}, "compliance"),
     "no contacts": (SERVOS, {"contacts": 0}, "contacts"),
     "contacts that fit into no memory": (SERVOS, {"contacts": 10**6}, "contacts: expected at most 2000"),
+    "caps without loads": (SERVOS, {"caps": 2}, "caps: expected none in quasi-static motion .* got 2"),
+    "caps of another cone": (
+        SERVOS,
+        {"motion": "dynamic", "cone": "stewart-trinkle", "caps": 2},
+        "caps: expected none",
+    ),
+    "a nominal control without forces": (SERVOS, {"ctrl": [0.1, 0.0]}, "ctrl: expected none in quasi-static"),
     "a step of years": (SERVOS, {"motion": "dynamic", "seconds": 1e9}, "time steps: expected at most 100000"),
 }
 if SINCE_MUJOCO_4:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from difflcs._checks import check_array, check_choice, check_kind, check_number, check_tensor, takes_arrays
+from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, assemble_lcs, count_forces, given_states
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
@@ -83,8 +84,8 @@ class MujocoLCS:
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
             `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.
         relative: True if the actions of `position` actuators on joints are relative to where these are.
-        ctrl: (nu,) nominal control of a dynamic motion, MuJoCo's `ctrl`; `params(x, context)` takes one for each
-            state. None: that at which servos have no force where the state is, and for other actuators that of `data`.
+        ctrl: (nu,) nominal control of a dynamic or quasi-dynamic motion, MuJoCo's `ctrl`; `params(x, context)` takes
+            one for each state. None: where servos have no force, and for other actuators that of `data`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
             geoms that move and may touch.
         limits: how many limits of joints and tendons a state has, those that the nominal action comes nearest to; None:
@@ -121,7 +122,7 @@ class MujocoLCS:
         caps: int | None = None,
     ):
         options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
-        friction, torsion = _check_options(motion, cone, mobility, friction, torsion, relative)
+        friction, torsion = _check_options(motion, cone, mobility, friction, torsion, relative, caps, ctrl)
         check_model(model, data, motion)
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
@@ -414,7 +415,7 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
 
 
 def _check_options(
-    motion: Any, cone: Any, mobility: Any, friction: Any, torsion: Any, relative: Any
+    motion: Any, cone: Any, mobility: Any, friction: Any, torsion: Any, relative: Any, caps: Any, ctrl: Any
 ) -> tuple[float | None, bool]:
     check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
     check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
@@ -422,6 +423,16 @@ def _check_options(
         check_choice("mobility", mobility, ("inertia", "damping"))
     if friction is not None:
         friction = check_number("friction", friction)
+    if caps and (motion == "quasi-static" or cone != "anitescu"):
+        raise InvalidInputError(
+            f"caps: expected none in {motion} motion with the cone {cone!r}, where they do nothing, got {caps!r:.100}; "
+            'leave them out, or use motion="dynamic" and the cone "anitescu"'
+        )
+    if ctrl is not None and motion == "quasi-static":
+        raise InvalidInputError(
+            f"ctrl: expected none in quasi-static motion, which it does not change, got {ctrl!r:.100};"
+            ' leave it out, or use motion="quasi-dynamic" or "dynamic"'
+        )
     check_kind("relative", relative, bool)
     return friction, check_kind("torsion", torsion, bool)
 

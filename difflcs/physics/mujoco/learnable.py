@@ -148,8 +148,8 @@ class LearnableMujocoLCS(nn.Module):
         ids = ids if of.offset else [i for i in ids if _columns(model, *of.fields[0])[i].any()]
         if not ids:
             raise InvalidInputError(
-                f"learn: expected the name of a {of.of} with a {kind} to learn, got {name!r:.100}; see the names in "
-                f"the model's XML"
+                f"learn: expected the name of a {of.of} with a {kind} to learn, got "
+                f"{'a model that has none' if name == '*' else repr(name):.100}; see the names in the model's XML"
             )
         if kind == "center_of_mass" and model.body_simple[ids].any():
             raise InvalidInputError(
