@@ -75,7 +75,7 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(capsys, tmp_pat
     first = line_of(capsys)
     assert set(first) >= KEYS
     assert (first["episodes"], first["mean_steps"], first["variant"]) == (1, 5, "noise 2 px")
-    monkeypatch.setattr("play", None)
+    monkeypatch.setattr(board, "play", None)
     play()  # from the record
     assert line_of(capsys) == first
     with pytest.raises(ValueError, match="name another file"):
