@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_positive_int, check_shape
-from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs._checks import check_kind, check_positive_int, check_shape, takes_arrays
+from difflcs.errors import ContactWarning, InvalidInputError, ShapeError
 from difflcs.physics.mujoco.learnable import Array, LearnableMujocoLCS, slope
 from difflcs.physics.mujoco.native import to_numpy
 
@@ -19,6 +19,7 @@ _LEAD = 2  # actions that bring about the velocities of states without any
 _USER = mujoco.mjtState.mjSTATE_USER
 
 
+@takes_arrays
 def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int = 20) -> list[float]:
     """Fit the parameters of a module to observed motion, by MuJoCo's own steps of the model that is learned.
 
@@ -48,6 +49,8 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
     state, lead = module.state, 0 if module.state.velocities else _LEAD
     check_shape("u", u, f"... {lead + 1}+ n_u", {"n_u": module.n_u}, "take longer motions")
     check_shape("x", x, "... H n_x", {"H": u.shape[-2] + 1, "n_x": module.n_x}, "one state more than actions")
+    if x.shape[:-2] != u.shape[:-2] or not u.numel():
+        raise ShapeError(f"x, u: expected one motion or more of the same batch, got {[*x.shape]} and {[*u.shape]}")
     ctrl = to_numpy(module.control(x[..., :-1, :], u)).reshape(-1, *u.shape[-2:])
     begin = state.flatten(x, module._data.act).reshape(len(ctrl), u.shape[-2] + 1, -1)
     seen = state.to_state(*np.split(begin, [state.nq, state.nq + state.nv], -1))  # no rotation beyond half a turn
