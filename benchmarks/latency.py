@@ -30,7 +30,7 @@ import tyro
 from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
-from difflcs.cli.bench import ACTION_LIMIT, machine, save, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, machine, save, smoke_path, states_and_goals
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.solution import Primal
 from difflcs.rl import Ensemble, get_method, get_task
@@ -107,13 +107,13 @@ class Step(NamedTuple):
     plan: MPCSolution
 
 
-def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Generator) -> list[Step]:
+def play(case: Case, episode: int, last: MPCSolution | None, generator: torch.Generator) -> list[Step]:
     """Play an episode in closed loop, after one that ended with a plan."""
     x, steps = case.starts[episode : episode + 1].clone(), []
     goal = () if case.goals is None else (case.goals[episode : episode + 1].clone(),)
     for _ in range(EPISODE):
-        guess = None if plan is None else plan.shift()
-        plan = case.mpc(x, *goal, guess=guess)
+        guess = None if last is None else last.shift()
+        last = plan = case.mpc(x, *goal, guess=guess)
         arrays = [value[0].numpy() for value in (x, *goal)]
         steps.append(Step((x, *goal), x.clone().requires_grad_(), arrays, guess, plan))
         noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
@@ -191,7 +191,7 @@ def main(o: Options) -> None:
     """Measure, print, write."""
     if o.smoke:
         o.episodes = 2
-        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
+        o.out = smoke_path(o.out)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DegenerateWarning)
     results = {}

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 import tyro
 
-from difflcs.cli.bench import machine, save
+from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.rl import evaluate, get_method, get_task, method_names
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
 from difflcs.rl.learning.ppo_settings import PPOSettings
@@ -114,7 +114,7 @@ def main(o: Options) -> None:
     """Train, evaluate, write."""
     if o.smoke:
         o.tasks, o.seeds, o.minutes, o.goals = o.tasks[:1], o.seeds[:1], [0, 0.4], 4
-        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
+        o.out = smoke_path(o.out)
     torch.set_num_threads(1)
     rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
     print(f"{len(rows)} evaluations are in {o.out} already; what is missing is added")

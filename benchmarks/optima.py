@@ -16,7 +16,7 @@ from bouncing import FAMILIES as BOUNCING
 from models import FAMILIES, Instance
 
 from difflcs import LCSMPCLayer
-from difflcs.cli.bench import machine, save
+from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.mpc.backends import Backend, BatchedBackend
 
 EFFORTS: dict[str, Backend] = {
@@ -112,7 +112,7 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     if o.smoke:
         o.problems, o.repetitions = 4, 1
-        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
+        o.out = smoke_path(o.out)
     results = json.loads(o.out.read_text())["results"] if o.only and o.out.exists() else {}
     for kind, make in {**FAMILIES, **BOUNCING}.items():
         if o.only and kind not in o.only:

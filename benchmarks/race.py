@@ -24,7 +24,7 @@ from race_problems import RELAXATION, as_mpc, small, with_contact, without_conta
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs.cli.bench import machine, save
+from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import MPCProblem
@@ -434,7 +434,7 @@ def main(o: Options) -> None:
         return
     if o.smoke:
         o.problems, o.batch, o.seeds, o.rounds = 2, 3, 1, 1
-        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
+        o.out = smoke_path(o.out)
     torch.set_num_threads(1)
     options = {name: getattr(o, name) for name in ("problems", "batch", "seeds", "rounds")}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}

@@ -24,7 +24,7 @@ import tyro
 from models import Instance, chain, chain_of_carts, pushing, pushing_model, random_model, to_rest
 
 from difflcs import LCSMPCLayer
-from difflcs.cli.bench import machine, save
+from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
 
 # n_x, n_lam, H
@@ -84,7 +84,7 @@ def main(o: Options) -> None:
     random, carts, horizons, models, few = RANDOM, CARTS, HORIZONS, WEAK_MODELS, WEAK_PROBLEMS
     if o.smoke:
         o.problems, o.seeds, random, carts, horizons, models, few = 4, 1, random[:1], carts[:1], horizons[:1], 2, 2
-        o.out = o.out.with_stem(f"{o.out.stem}-smoke")
+        o.out = smoke_path(o.out)
     rows = []
     for n_x, n_lam, horizon in random:
         systems = [random_model(n_lam, seed, n_x, n_u=2 * n_x // 3) for seed in range(o.seeds)]

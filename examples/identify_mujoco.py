@@ -35,6 +35,7 @@ from difflcs import GoalCost, cli
 from difflcs.errors import ContactWarning
 from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoState, identify
 from difflcs.rl import PhysicsSpec, Quantity, TaskSpec, load_policy, register_task
+from difflcs.rl.rollout import windows
 from difflcs_envs.hand.model import build_model
 
 GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -120,8 +121,7 @@ def recover(name: str, model: Any, learn: list[Any], o: Options) -> None:
     """Fit one model, and print the factors that are left."""
     module = guess(model, learn, o.wrong, o.step)
     guessed, (x, u), begun = module.change.detach().exp(), gather(model, module, o), time.process_time()
-    x = x.unfold(1, o.window + 1, 1).mT.flatten(0, 1)
-    u = u.unfold(1, o.window, 1).mT.flatten(0, 1)
+    x, u = windows(x, u, o.window)
     some = np.random.default_rng(o.seed).permutation(len(x))[: o.transitions // o.window]
     losses = identify(module, x[some], u[some])
     print(

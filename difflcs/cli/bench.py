@@ -113,6 +113,11 @@ def best(repeats: int, work: Callable[[], object]) -> float:
     return min(times)
 
 
+def smoke_path(path: Path) -> Path:
+    """Return the path of a record of `--smoke`, beside the one that is tracked."""
+    return path.with_stem(f"{path.stem}-smoke")
+
+
 def save(path: Path, record: dict) -> None:
     """Write the record of a benchmark as JSON, atomically; its keys keep their order."""
     _storage.write_atomically(path, (json.dumps(record, indent=2, ensure_ascii=False) + "\n").encode())

@@ -19,6 +19,7 @@ from difflcs.rl.runs.figures import NoPictureError, plot_learning_curve
 from difflcs.rl.runs.progress import Progress
 from difflcs.rl.runs.training import TrainConfig, stored_config, sum_seconds, train
 from difflcs.rl.tasks import get_task, is_installed, task_names
+from difflcs.zoo import success_text
 
 
 @dataclass(frozen=True)
@@ -149,8 +150,9 @@ class Demo:
         goals = get_task(config.task).example_goals
         video = self._video(run, goals[:1] if self.smoke else goals)
         evaluated = [row for row in rows if row["evaluation_goals"]]
-        print(f"\nsuccess before learning: {_from_row(evaluated[0])}")
-        print(f"success after {float(evaluated[-1]['minutes']):g} minutes of data: {_from_row(evaluated[-1])}")
+        before, after = (success_text(evaluated[i], "evaluation_") for i in (0, -1))
+        print(f"\nsuccess before learning: {before}")
+        print(f"success after {float(evaluated[-1]['minutes']):g} minutes of data: {after}")
         print(f"learning curve: {run.path / 'learning_curve.png'}\nvideo: {video}\nmodel: {run.model}")
         seconds = time.perf_counter() - start
         print(f"goal seed {config.evaluation_seed}, training seed {config.seed}, {seconds:.0f} s, {known_versions()}")
@@ -166,8 +168,3 @@ class Demo:
     def interrupted(self) -> str:
         """Return the advice after Ctrl-C."""
         return "run the same command again to continue"
-
-
-def _from_row(row: dict[str, str]) -> str:
-    rate, low, high = (100 * float(row[f"evaluation_{name}"]) for name in ("success_rate", "ci_low", "ci_high"))
-    return f"{rate:.1f} % of {row['evaluation_goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"

@@ -291,6 +291,11 @@ def transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
     return state[:, :-1].flatten(0, 1), episodes["action"].flatten(0, 1), state[:, 1:].flatten(0, 1)
 
 
+def windows(states: Tensor, actions: Tensor, length: int) -> tuple[Tensor, Tensor]:
+    """Cut all windows (M, length + 1, n_x), (M, length, n_u) out of episodes (N, T + 1, n_x), (N, T, n_u)."""
+    return states.unfold(1, length + 1, 1).mT.flatten(0, 1), actions.unfold(1, length, 1).mT.flatten(0, 1)
+
+
 def contexts(episodes: TensorDict) -> Tensor | None:
     """Return the contexts (N·T, n_context) of the `transitions` of a record of episodes; None if it has none."""
     if CONTEXT not in episodes.keys():

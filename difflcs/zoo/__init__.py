@@ -81,8 +81,7 @@ class ModelCard:
     @property
     def success_text(self) -> str:
         """Success rate, goals and interval, as `difflcs evaluate` prints them."""
-        rate, low, high = (100 * value for value in (self.success_rate, self.ci_low, self.ci_high))
-        return f"{rate:.1f} % of {self.goals} goals (95 % interval {low:.1f} to {high:.1f} %)"
+        return success_text(vars(self))
 
     def __str__(self) -> str:
         lines = {
@@ -202,6 +201,12 @@ def check_object(description: Mapping[str, Any], source: object) -> None:
             f"{source}: expected texts and numbers that describe an object, got {_storage.short(dict(description))}; "
             f"restore it from a copy"
         )
+
+
+def success_text(figures: Mapping[str, Any], prefix: str = "") -> str:
+    """Format a success rate, its goals and its interval, whose names have this prefix, as every command prints them."""
+    rate, low, high = (100 * float(figures[prefix + name]) for name in ("success_rate", "ci_low", "ci_high"))
+    return f"{rate:.1f} % of {figures[prefix + 'goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"
 
 
 def describe(description: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.trainer import AfterStep, EpisodesReport, EpisodeTrainer
-from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions, uniform_actions
+from difflcs.rl.rollout import Policy, contexts, mpc_actions, noisy_actions, transitions, uniform_actions, windows
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
 from difflcs.scales import Scales
@@ -135,9 +135,8 @@ class PhysicsFit(EpisodeTrainer):
     def _identify(self, simulated: int) -> list[float]:
         from difflcs.physics.mujoco import identify  # MuJoCo need not be installed
 
-        states, actions = self.buffer["state"], self.buffer["action"]
-        window = min(self.settings.window, actions.shape[1])
-        x, u = states.unfold(1, window + 1, 1).mT.flatten(0, 1), actions.unfold(1, window, 1).mT.flatten(0, 1)
+        window = min(self.settings.window, self.episode_steps)
+        x, u = windows(self.buffer["state"], self.buffer["action"], window)
         random = np.random.default_rng((self.seed, Stream.MINIBATCH, self.iteration))
         chosen = random.choice(len(x), min(len(x), max(1, simulated // window)), replace=False)
         return identify(self.lcs, x[chosen], u[chosen])

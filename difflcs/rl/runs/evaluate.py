@@ -17,6 +17,7 @@ from difflcs.records import LCSModule, LCSParams
 from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
 from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.zoo import success_text
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -53,8 +54,7 @@ class Evaluation:
     unstable: int
 
     def __str__(self) -> str:
-        rate, low, high = (100 * value for value in (self.success_rate, self.ci_low, self.ci_high))
-        return f"{rate:.1f} % of {self.goals} goals (95 % interval {low:.1f} to {high:.1f} %)"
+        return success_text(vars(self))
 
     def summary(self) -> str:
         """Success and what went wrong, in one line."""
