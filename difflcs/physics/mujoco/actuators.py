@@ -10,6 +10,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_kind, check_tensor
 from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.native import flags, to_numpy
 
 Array = NDArray[np.float64]
@@ -117,14 +118,6 @@ class Actuators:
                 force[:, i] = np.maximum(force[0, i], low), np.minimum(force[1, i], high)
         return force
 
-    def clip(self, ctrl: Array) -> Array:
-        """Controls (nu,) within their range."""
-        return np.clip(ctrl, *self.range)
-
-    def balance(self, length: Array) -> Array:
-        """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
-        return np.where(self.holds, -(self.constant + self.bias * length) / self.gain, 0.0)
-
     def yields(self, moved: Array, velocity: Array | float) -> Array:
         """Part (nu,) of its force that an actuator keeps at the end of a step, as it moves.
 
@@ -224,12 +217,21 @@ class Actuators:
         """Let activations of a model change by their rates, however long the step, to whatever value."""
         model.actuator_dyntype[self._exact], model.actuator_actlimited[:], model.actuator_actearly[:] = _FILTER, 0, 0
 
-    def describe_balance(self, relative: NDArray[np.intp]) -> dict[str, list[Any]]:
-        """Describe `balance` and `clip` for the compiled part; actions of `relative` count from where they are."""
+    def describe(
+        self, simulated: Any, relative: Any = (), linearised: Any = None, steps: int = 0, advance: int = 0
+    ) -> _mujoco.Motion:
+        """Describe a motion for the compiled part: models, MuJoCo's steps, and what balances and limits the controls.
+
+        Actions of the actuators `relative` count from where they are. The models must outlive it.
+        """
+        fields = {name: getattr(simulated, name) for name in ("nq", "nv", "nu", "na")}
+        fields |= {"simulated": simulated._address, "linearised": (linearised or simulated)._address}
         low, high = self.range
-        numbers = {"gain": self.gain, "constant": self.constant, "bias": self.bias, "low": low, "high": high}
-        masks = {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
-        return {name: values.tolist() for name, values in (numbers | masks).items()}
+        arrays = {"gain": self.gain, "constant": self.constant, "bias": self.bias, "low": low, "high": high}
+        arrays |= {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
+        arrays |= {"activated": self.activated}
+        listed = {name: values.tolist() for name, values in arrays.items()}
+        return _mujoco.Motion(fields | listed | {"steps": steps, "advance": advance})
 
 
 def disabled_actuators(model: Any) -> NDArray[np.bool_]:

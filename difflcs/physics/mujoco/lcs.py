@@ -29,7 +29,7 @@ from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, ta
 from difflcs.physics.mujoco.nominal import Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
-from difflcs.physics.mujoco.readings import Readings, read_each
+from difflcs.physics.mujoco.readings import Readings
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
@@ -137,7 +137,8 @@ class MujocoLCS:
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
         self._equality = Equality(model, self._data)
-        self._rows = RowFinder(model, self._data, limits, motion != "quasi-static")
+        self._places = Places(model, self._data)
+        self._rows = RowFinder(model, self._places, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         stops = limits != 0 and not disabled & flags("CONSTRAINT", "LIMIT")
         self._actuators, self._relative = Actuators(model, stops), relative
@@ -160,7 +161,7 @@ class MujocoLCS:
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
         self._parts = torch.rand(_BETWEEN, 1, model.nu, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
-        more, self._places = (distance, length, budgets, friction, torsion, pushed), Places(model, self._data)
+        more = distance, length, budgets, friction, torsion, pushed
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
         caps = 0 if motion == "quasi-static" or cone != "anitescu" else caps
         self._caps = Caps(model, self._servos.moment, self._finder, length, caps)
@@ -335,7 +336,7 @@ class MujocoLCS:
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._caps.order(self._finder.find(qpos))
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        moved = read_each(self._motion, self._places, self._model, self._data, states, ctrl)
+        moved = self._motion.read(self._places, states, ctrl)
         if isinstance(self._motion, Dynamic):
             moved = self._motion.find_secants(moved, self._places, states, flat)
         return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
@@ -345,7 +346,7 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
-    moved = read_each(of._motion, of._places, model, data, here, of._ctrl[None])
+    moved = of._motion.read(of._places, here, of._ctrl[None])
     x = np.zeros((1, of.n_x))
     if not isinstance(of._motion, Dynamic):
         response = far = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]

@@ -40,6 +40,8 @@ _FIELDS = (
     "actuator_length",
     "qacc",
     "act_dot",
+    "qfrc_smooth",
+    "ten_length",
 )
 _VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error", "mjcb_time")
 _KINDS, _MOST, _FIRST = int(mujoco.mjtGeom.mjNGEOMTYPES), 128, 10  # doubles of a contact, and those that are read
@@ -101,7 +103,9 @@ class Place:
     def __init__(self, model: Any, data: Any):
         self.model, self.data = model, data
         found = {name: _address(name, getattr(data, name)) for name in _FIELDS}
-        warnings = data.warning.number
+        warnings, nv = data.warning.number, int(model.nv)
+        moment = (data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+        found |= {"moment": _describe_sparse(int(model.nu), nv, *moment), "tendon": _describe_tendons(model, data)}
         found |= {"model": model._address, "data": data._address, "ccd_tolerance": _option(model)}
         found |= {"warnings": warnings.ctypes.data, "kinds": len(warnings), "stride": warnings.strides[0] // 4}
         self.native = _mujoco.Place(found)
@@ -145,10 +149,24 @@ class Places:
                     raise mujoco.FatalError(said)
 
 
-def _address(name: str, field: np.ndarray) -> int:
-    if field.dtype != np.float64 or not field.flags.c_contiguous:
-        raise ImportError(_OTHER.format(mujoco.__version__, f"numbers of double precision in {name}"))
+def _address(name: str, field: np.ndarray, kind: type = np.float64) -> int:
+    if field.dtype != kind or not field.flags.c_contiguous:
+        raise ImportError(_OTHER.format(mujoco.__version__, f"numbers of {np.dtype(kind)} in {name}"))
     return field.ctypes.data
+
+
+def _describe_sparse(rows: int, size: int, values: np.ndarray, *where: np.ndarray) -> dict[str, int]:
+    """Describe a matrix (rows, size) by its values and where they are: counts, beginnings and columns of the rows."""
+    places = [_address("rows that are sparse", field, np.int32) for field in where] or [0, 0, 0]
+    found = {"rows": rows, "size": size, "values": _address("a matrix", values)}
+    return found | dict(zip(("counts", "starts", "columns"), places, strict=True))
+
+
+def _describe_tendons(model: Any, data: Any) -> dict[str, int]:
+    """Describe the derivatives (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
+    names, rows, size = ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind"), int(model.ntendon), int(model.nv)
+    where = [getattr(data if hasattr(data, name) else model, name) for name in names]
+    return _describe_sparse(rows, size, data.ten_J, *where * (data.ten_J.size != rows * size))
 
 
 def _option(model: Any) -> int:

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from difflcs._checks import check_positive_int
 from difflcs.errors import ContactWarning, warn
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
+from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.motion import DynamicStep
-from difflcs.physics.mujoco.native import flags, native
+from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 MOST_LIMITS = 8  # by default
@@ -107,14 +109,14 @@ class RowFinder:
 
     Args:
         model: a private copy, before its flags are changed.
-        data: its data.
+        places: of the model and its data.
         limits: how many limits a state has, those nearest to acting; None: of all joints and tendons that have some, at
             most `MOST_LIMITS`, with a `ContactWarning` where more act.
         friction: False if dry friction is left out.
     """
 
-    def __init__(self, model: Any, data: Any, limits: int | None, friction: bool):
-        self.model, self.data = model, data
+    def __init__(self, model: Any, places: Places, limits: int | None, friction: bool):
+        self.model, self._places = model, places
         disabled = model.opt.disableflags
         limits_act, rubs = (not disabled & flags("CONSTRAINT", name) for name in ("LIMIT", "FRICTIONLOSS"))
         most = MOST_LIMITS if limits is None else check_positive_int("limits", limits, minimum=0)
@@ -219,13 +221,11 @@ class RowFinder:
 
     def _read_tendons(self, qpos: Array) -> tuple[Array, Array]:
         """Return lengths (n, ntendon) of tendons at positions (n, nq), and their derivatives (n, ntendon, nv)."""
-        model, data, n = self.model, self.data, len(qpos)
-        length, tendons = np.zeros((n, model.ntendon)), np.zeros((n, model.ntendon, model.nv))
-        for i in range(n * bool(len(self._tendons) + len(self._rubbing_tendons))):
-            with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:] = qpos[i]
-                mujoco.mj_fwdPosition(model, data)
-                length[i], tendons[i] = data.ten_length, tendon_jacobian(model, data)
+        n, count = len(qpos), self.model.ntendon
+        length, tendons = np.zeros((n, count)), np.zeros((n, count, self.model.nv))
+        if len(self._tendons) + len(self._rubbing_tendons):
+            taken = library(), self._places.take(n), np.ascontiguousarray(qpos)
+            self._places.check(_mujoco.read_tendons(*taken, length, tendons), n)
         return length, tendons
 
     def _warn_of_more(self, after: Array) -> None:
@@ -389,16 +389,3 @@ def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -
     stiffness = np.where(standard, (inverse / np.where(standard, ratio, 1.0)) ** 2, -time / most**2)
     stiffness[of_limits:] = 0.0
     return stiffness, np.where(standard, 2 * inverse, -ratio / most)
-
-
-def tendon_jacobian(model: Any, data: Any) -> Array:
-    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
-    jacobian = np.zeros((model.ntendon, model.nv))
-    if data.ten_J.size == jacobian.size:
-        return data.ten_J.reshape(jacobian.shape)
-    where = (
-        getattr(data if hasattr(data, name) else model, name)
-        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
-    )
-    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
-    return jacobian

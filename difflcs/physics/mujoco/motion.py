@@ -77,6 +77,7 @@ class QuasiStatic:
         self.B = np.zeros((model.nv, model.nu))
         self.B[actuators.dof, np.arange(model.nu)] = 1.0
         self.mobility = None if isinstance(mobility, str) and mobility == "inertia" else self._fixed(mobility)
+        self._native = actuators.describe(model)
 
     def _fixed(self, mobility: str | Array) -> Array:
         nv = self.model.nv
@@ -97,15 +98,18 @@ class QuasiStatic:
             )
         return fixed
 
-    def allocate(self, n: int) -> Array:
-        """Make a buffer for the inverse mass matrices of n states."""
-        return np.zeros((n, self.model.nv, self.model.nv))
+    def read(self, places: Places, states: Array, ctrl: Array) -> Array:
+        """Read the inverse mass matrices (n, nv, nv) at states (n, nq + nv + na); the controls (n, nu) do not matter.
 
-    def read(self, i: int, data: Any, arrays: Array, ctrl: Array) -> None:
-        """Read the state in `data`, for which `mj_fwdPosition` was called; the controls do not matter."""
-        del ctrl
+        Raises:
+            InvalidInputError: MuJoCo raised an error, or has counted a warning.
+        """
+        n, nv, none = len(states), self.model.nv, np.zeros(0)
+        inverse_mass = np.zeros((n, nv, nv))
         if self.mobility is None:
-            mujoco.mj_solveM(self.model, data, arrays[i], np.eye(self.model.nv))
+            taken = library(), self._native, places.take(n), states, np.ascontiguousarray(ctrl), inverse_mass
+            places.check(_mujoco.read_rest(*taken, *[none] * 5), n)
+        return inverse_mass
 
     def finish(self, arrays: Array, x: Array, tangent: Array | None) -> FreeMotion:
         """Return the motion at states x (n, nv), for the tangent of their rotations."""
@@ -279,11 +283,10 @@ class Dynamic:
         linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
         linearised.opt.solver, linearised.opt.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-15
         actuators.unlimit_rates(linearised)
-        fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
-        fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": steps.count}
         advance = _ADVANCE.get(steps.integrator)
-        fields["advance"] = addresses()[advance] if advance else 0
-        return _mujoco.Motion(fields | actuators.describe_balance(self.relative))
+        return actuators.describe(
+            simulated, self.relative, linearised, steps.count, addresses()[advance] if advance else 0
+        )
 
     def finish(self, read: Linearised, x: Array, equality: Any = None) -> DynamicStep:
         """Return the motion at states x (n, n_x), with soft equality constraints, `EqualityRows`."""

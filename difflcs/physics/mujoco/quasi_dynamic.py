@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
-from difflcs.physics.mujoco.limits import tendon_jacobian
+from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
@@ -88,6 +89,7 @@ class QuasiDynamic:
         self._bias = model.actuator_biasprm[:, :3] * (model.actuator_biastype == BIASES[1])[:, None]
         for force in (self._gain, self._bias):
             force[disabled_actuators(model)], force[actuators.drifts, 1] = 0.0, 0.0
+        self._native = actuators.describe(model)
         springs, dampers = (not model.opt.disableflags & flags(name) for name in ("SPRING", "DAMPER"))
         self._tendons = model.tendon_stiffness * springs, model.tendon_damping * dampers
         self._servo_damping = getattr(model, "actuator_damping", np.zeros(model.nu)) * dampers
@@ -97,31 +99,21 @@ class QuasiDynamic:
         dofs = model.jnt_dofadr[straight]
         self._springs[dofs, dofs] = model.jnt_stiffness[straight] * springs
 
-    def allocate(self, n: int) -> Rest:
-        """Make buffers for n states."""
-        nv, nu = self.model.nv, self.model.nu
-        sizes = (nv,), (nv, nv), (nu, nv), (self.model.ntendon, nv), (nu,), (nu,), (nu,), (nu,)
-        return Rest(*(np.zeros((n, *size)) for size in sizes))
+    def read(self, places: Places, states: Array, ctrl: Array) -> Rest:
+        """Read the motion at states (n, nq + nv + na) of MuJoCo, at nominal controls (n, nu); NaN: balance.
 
-    def read(self, i: int, data: Any, into: Rest, ctrl: Array) -> None:
-        """Read the state in `data`, for which `mj_fwdPosition` was called, at nominal controls (nu,); NaN: balance."""
-        model, length = self.model, data.actuator_length
-        data.ctrl[:] = self.actuators.clip(np.where(np.isnan(ctrl), self.actuators.balance(length), ctrl))
-        data.act[:] = data.ctrl[self.actuators.activated]  # filters have settled
-        mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_fwdActuation(model, data)
-        mujoco.mj_fwdAcceleration(model, data)
-        into.force[i], into.nominal[i] = data.qfrc_smooth, data.ctrl - length * self.relative
-        into.gain[i] = self._gain[:, 0] + self._gain[:, 1] * length
-        into.stiffness[i] = -self._bias[:, 1] - self._gain[:, 1] * data.ctrl
-        into.damping[i] = np.maximum(-self._bias[:, 2] - self._gain[:, 2] * data.ctrl, 0.0) + self._servo_damping
-        if model.nu:
-            mujoco.mju_sparse2dense(
-                into.moment[i], data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-            )
-        if model.ntendon:
-            into.tendon[i] = tendon_jacobian(model, data)
+        Raises:
+            InvalidInputError: MuJoCo raised an error, or has counted a warning.
+        """
+        n, nv, nu, tendons = len(states), self.model.nv, self.model.nu, self.model.ntendon
+        sizes = (nv, nv), (nv,), (nu,), (nu,), (nu, nv), (tendons, nv)
+        arrays = mass, force, held, length, moment, tendon = [np.zeros((n, *size)) for size in sizes]
+        taken = library(), self._native, places.take(n), states, np.ascontiguousarray(ctrl)
+        places.check(_mujoco.read_rest(*taken, *arrays), n)
+        gain = self._gain[:, 0] + self._gain[:, 1] * length
+        stiffness = -self._bias[:, 1] - self._gain[:, 1] * held
+        damping = np.maximum(-self._bias[:, 2] - self._gain[:, 2] * held, 0.0) + self._servo_damping
+        return Rest(force, mass, moment, tendon, held - length * self.relative, gain, stiffness, damping)
 
     def finish(self, read: Rest, x: Array, tangent: Array | None) -> FreeMotion:
         """Return the motion at states x (n, nv), for the tangent of their rotations."""

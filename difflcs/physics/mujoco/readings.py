@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import torch
 
 from difflcs.physics.complementarity import Bounded, Contacts, Unilateral
 from difflcs.physics.mujoco.contacts import MujocoContacts
-from difflcs.physics.mujoco.library import Places
-from difflcs.physics.mujoco.limits import Array, ScaledRows
-from difflcs.physics.mujoco.motion import Dynamic
-from difflcs.physics.mujoco.native import native
+from difflcs.physics.mujoco.limits import ScaledRows
 
 
 class Readings(NamedTuple):
@@ -72,21 +68,3 @@ class Readings(NamedTuple):
         if still := self.x.shape[-1] - rows.shape[-1]:
             rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1)
         return self.batched(rows)
-
-
-def read_each(motion: Any, places: Places, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
-    """Read a motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu); of positions one by one.
-
-    Raises:
-        InvalidInputError: MuJoCo raised an error, or has counted a warning.
-    """
-    if isinstance(motion, Dynamic):
-        return motion.read(places, states, ctrl)
-    moved = motion.allocate(len(states))
-    for i, state in enumerate(states):
-        with native(model, data, f"in state {i} of {len(states)}"):
-            data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq : model.nq + model.nv]
-            data.act[:] = state[model.nq + model.nv :]
-            mujoco.mj_fwdPosition(model, data)
-            motion.read(i, data, moved, ctrl[i])
-    return moved

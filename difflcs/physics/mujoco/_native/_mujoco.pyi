@@ -42,6 +42,22 @@ def read_motion(
     nominal: np.ndarray,
     reached: np.ndarray,
 ) -> tuple[int, int, str]: ...
+def read_rest(
+    library: Library,
+    motion: Motion,
+    places: Sequence[Place],
+    state: np.ndarray,
+    ctrl: np.ndarray,
+    inverse_mass: np.ndarray,
+    force: np.ndarray,
+    nominal: np.ndarray,
+    length: np.ndarray,
+    moment: np.ndarray,
+    tendon: np.ndarray,
+) -> tuple[int, int, str]: ...
+def read_tendons(
+    library: Library, places: Sequence[Place], qpos: np.ndarray, length: np.ndarray, tendon: np.ndarray
+) -> tuple[int, int, str]: ...
 def simulate(
     library: Library,
     motion: Motion,

@@ -1,6 +1,7 @@
 // The MuJoCo library that Python has loaded, by addresses: no header of it, hence no version.
 #pragma once
 
+#include <algorithm>
 #include <csetjmp>
 #include <cstdint>
 #include <cstdio>
@@ -39,12 +40,28 @@ struct Library {
   void** clock;  // which MuJoCo reads in every stage
 };
 
+// A matrix in a model's data; without counts of its rows it is dense.
+struct Sparse {
+  int rows, size;  // number of its rows, and of the numbers in each
+  const double* values;
+  const int32_t *counts, *starts, *columns;
+
+  void write(double* dense) const {
+    if (counts == nullptr) std::copy_n(values, rows * size, dense);
+    for (int i = 0; counts != nullptr && i < rows; i++) {
+      std::fill_n(dense + i * size, size, 0.0);
+      for (int k = starts[i]; k < starts[i] + counts[i]; k++) dense[i * size + columns[k]] = values[k];
+    }
+  }
+};
+
 // A model and its data, used by one thread at a time.
 struct Place {
   const void* model;
   void* data;
   double *qpos, *qvel, *act, *ctrl, *qacc_warmstart, *geom_xpos, *ccd_tolerance;
-  const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot;
+  const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot, *qfrc_smooth, *ten_length;
+  Sparse moment, tendon;  // derivatives of the lengths of actuators and tendons
   int32_t* warnings;  // how often MuJoCo has warned, by kinds
   int kinds, stride;  // of warnings, and from one to the next
 

@@ -101,6 +101,11 @@ Scene make_scene(const nb::dict& f) {
   return s;
 }
 
+Sparse make_sparse(const nb::dict& f) {
+  return {value<int>(f, "rows"),           value<int>(f, "size"),           at<const double*>(f, "values"),
+          at<const int32_t*>(f, "counts"), at<const int32_t*>(f, "starts"), at<const int32_t*>(f, "columns")};
+}
+
 Place make_place(const nb::dict& f) {
   Place p{};
   p.model = at<const void*>(f, "model");
@@ -118,6 +123,10 @@ Place make_place(const nb::dict& f) {
   p.actuator_length = at<const double*>(f, "actuator_length");
   p.qacc = at<const double*>(f, "qacc");
   p.act_dot = at<const double*>(f, "act_dot");
+  p.qfrc_smooth = at<const double*>(f, "qfrc_smooth");
+  p.ten_length = at<const double*>(f, "ten_length");
+  p.moment = make_sparse(value<nb::dict>(f, "moment"));
+  p.tendon = make_sparse(value<nb::dict>(f, "tendon"));
   p.warnings = at<int32_t*>(f, "warnings");
   p.kinds = value<int>(f, "kinds");
   p.stride = value<int>(f, "stride");
@@ -141,6 +150,7 @@ Motion make_motion(const nb::dict& f) {
     const auto mask = value<std::vector<bool>>(f, name);
     into->assign(mask.begin(), mask.end());
   }
+  m.activated = value<std::vector<int>>(f, "activated");
   m.identity.assign(static_cast<size_t>(m.nv) * m.nv, 0.0);
   for (int v = 0; v < m.nv; v++) m.identity[v * m.nv + v] = 1.0;
   return m;
@@ -223,6 +233,40 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
   });
 }
 
+// Reads the inverse mass (n, nv, nv) at states and, unless `force` is empty, what is `AtRest` at nominal controls.
+Outcome read_rest(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
+                  Array<const double> state, Array<const double> ctrl, Array<double> inverse_mass, Array<double> force,
+                  Array<double> nominal, Array<double> length, Array<double> moment, Array<double> tendon) {
+  const size_t n = state.shape(0), nv = motion.nv, nu = motion.nu;
+  check(state.size() == n * (motion.nq + nv + motion.na) && ctrl.size() == n * nu && !places.empty() &&
+        inverse_mass.size() == n * nv * nv);
+  const size_t tendons = places[0]->tendon.rows, rest = force.size() > 0 ? n : 0;
+  check(force.size() == rest * nv && nominal.size() == rest * nu && length.size() == rest * nu &&
+        moment.size() == rest * nu * nv && tendon.size() == rest * tendons * nv);
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
+    const Reader reader(library, motion, *places[p]);
+    const double* from = state.data() + i * state.shape(1);
+    const AtRest into{inverse_mass.data() + i * nv * nv, force.data() + i * nv,       nominal.data() + i * nu,
+                      length.data() + i * nu,            moment.data() + i * nu * nv, tendon.data() + i * tendons * nv};
+    rest > 0 ? reader.read_rest(from, ctrl.data() + i * nu, into) : reader.read_mass(from, into.inverse_mass);
+  });
+}
+
+// Reads the lengths (n, ntendon) of tendons at positions qpos (n, nq), and their derivatives (n, ntendon, nv).
+Outcome read_tendons(const Library& library, const std::vector<const Place*>& places, Array<const double> qpos,
+                     Array<double> length, Array<double> tendon) {
+  check(!places.empty() && length.size() == qpos.shape(0) * places[0]->tendon.rows &&
+        tendon.size() == length.size() * places[0]->tendon.size);
+  return at_places(library, places, qpos.shape(0), [&](size_t p, int64_t i) {
+    const Place& place = *places[p];
+    const Sparse& of = place.tendon;
+    std::copy_n(qpos.data() + i * qpos.shape(1), qpos.shape(1), place.qpos);
+    library.fwd_position(place.model, place.data);
+    std::copy_n(place.ten_length, of.rows, length.data() + i * of.rows);
+    of.write(tendon.data() + i * of.rows * of.size);
+  });
+}
+
 // Simulates steps from states (n, nq + nv + na) at controls (n, nu): ζ, ν and the change of activation (n, 2 nv + na)
 // after them, NaN where MuJoCo warns.
 Outcome simulate(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
@@ -282,6 +326,11 @@ NB_MODULE(_mujoco, m) {
   m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
         "acceleration"_a, "A"_a, "B"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
         "Motion at many states. Returns where MuJoCo said an error or warned.");
+  m.def("read_rest", &read_rest, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "inverse_mass"_a, "force"_a,
+        "nominal"_a, "length"_a, "moment"_a, "tendon"_a,
+        "Motion at rest at many states. Returns where MuJoCo said an error or warned.");
+  m.def("read_tendons", &read_tendons, "library"_a, "places"_a, "qpos"_a, "length"_a, "tendon"_a,
+        "Tendons at many positions. Returns where MuJoCo said an error or warned.");
   m.def("simulate", &simulate, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "after"_a,
         "Steps from many states. Returns where MuJoCo said an error.");
   m.def("solve_soft", &solve_soft, "J"_a, "R"_a, "q"_a, "compliance"_a, "low"_a, "high"_a, "threads"_a, "force"_a,

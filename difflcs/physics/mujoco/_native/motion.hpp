@@ -12,6 +12,7 @@ namespace difflcs::physics {
 
 constexpr double kBeyond = 1e9;  // acceleration of a simulation that diverges and says nothing
 constexpr double kDifference = 1e-6;
+constexpr int kPositions = 1;  // the stage of MuJoCo that computes them, as one to skip
 
 // What all states have in common.
 struct Motion {
@@ -22,6 +23,7 @@ struct Motion {
   std::vector<double> gain, constant, bias;  // (nu) of actuators that hold a length
   std::vector<double> low, high;             // (nu) range of controls
   std::vector<char> holds, relative;         // (nu)
+  std::vector<int> activated;                // (na) the actuator of each activation
   std::vector<double> identity;              // (nv, nv)
 
   int size() const { return 2 * nv + na; }
@@ -32,6 +34,11 @@ struct Linearised {
   double *middle, *acceleration, *A, *B, *inverse_mass, *nominal, *reached;
 };
 
+// One row of each array of `Rest` in quasi_dynamic.py that is read.
+struct AtRest {
+  double *inverse_mass, *force, *ctrl, *length, *moment, *tendon;
+};
+
 // Reads the motion at a state of qpos, qvel and act, with nominal controls, NaN where actuators have no force.
 class Reader {
  public:
@@ -40,15 +47,10 @@ class Reader {
 
   void read(const double* state, const double* ctrl, const Linearised& into) const {
     const Motion& m = motion_;
-    set(state);
-    library_.fwd_position(m.simulated, place_.data);
-    library_.solve_mass(m.simulated, place_.data, into.inverse_mass, m.identity.data(), m.nv);
-    for (int j = 0; j < m.nu; j++) {
-      const double length = place_.actuator_length[j];
-      const double balance = m.holds[j] ? -(m.constant[j] + m.bias[j] * length) / m.gain[j] : 0.0;
-      place_.ctrl[j] = std::clamp(std::isnan(ctrl[j]) ? balance : ctrl[j], m.low[j], m.high[j]);
-      into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? length : 0.0);
-    }
+    read_mass(state, into.inverse_mass);
+    hold(ctrl);
+    for (int j = 0; j < m.nu; j++)
+      into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? place_.actuator_length[j] : 0.0);
     simulate(m.steps / 2);
     forward(m.linearised);
     if (!std::all_of(place_.qacc, place_.qacc + m.nv, [](double a) { return std::fabs(a) < kBeyond; })) {
@@ -61,6 +63,27 @@ class Reader {
     library_.transition(m.linearised, place_.data, kDifference, 0, into.A, into.B, nullptr, nullptr);
     simulate(m.steps - m.steps / 2);
     change(state, into.reached);
+  }
+
+  // Write M⁻¹.
+  void read_mass(const double* state, double* inverse_mass) const {
+    set(state);
+    library_.fwd_position(motion_.simulated, place_.data);
+    library_.solve_mass(motion_.simulated, place_.data, inverse_mass, motion_.identity.data(), motion_.nv);
+  }
+
+  // Read the forces at rest, in which activation has settled.
+  void read_rest(const double* state, const double* ctrl, const AtRest& into) const {
+    const Motion& m = motion_;
+    read_mass(state, into.inverse_mass);
+    hold(ctrl);
+    for (int j = 0; j < m.na; j++) place_.act[j] = place_.ctrl[m.activated[j]];
+    library_.forward(m.simulated, place_.data, kPositions, 1);
+    std::copy_n(place_.qfrc_smooth, m.nv, into.force);
+    std::copy_n(place_.ctrl, m.nu, into.ctrl);
+    std::copy_n(place_.actuator_length, m.nu, into.length);
+    place_.moment.write(into.moment);
+    place_.tendon.write(into.tendon);
   }
 
   // Write ζ, ν and the change of activation after the steps from a state at a control.
@@ -77,6 +100,15 @@ class Reader {
     std::copy_n(state, motion_.nq, place_.qpos);
     std::copy_n(state + motion_.nq, motion_.nv, place_.qvel);
     std::copy_n(state + motion_.nq + motion_.nv, motion_.na, place_.act);
+  }
+
+  // Set nominal controls.
+  void hold(const double* ctrl) const {
+    const Motion& m = motion_;
+    for (int j = 0; j < m.nu; j++) {
+      const double balance = m.holds[j] ? -(m.constant[j] + m.bias[j] * place_.actuator_length[j]) / m.gain[j] : 0.0;
+      place_.ctrl[j] = std::clamp(std::isnan(ctrl[j]) ? balance : ctrl[j], m.low[j], m.high[j]);
+    }
   }
 
   void forward(const void* model) const { library_.forward(model, place_.data, 0, 1); }
