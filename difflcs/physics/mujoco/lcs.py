@@ -136,8 +136,7 @@ class MujocoLCS:
         self._given = disabled, taken(self._data), options
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
-        self._equality = Equality(model, self._data)
-        self._places = Places(model, self._data)
+        self._equality, self._places = Equality(model, self._data), Places(model, self._data)
         self._rows = RowFinder(model, self._places, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         stops = limits != 0 and not disabled & flags("CONSTRAINT", "LIMIT")
