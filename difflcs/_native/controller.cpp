@@ -15,14 +15,19 @@ using Clock = std::chrono::steady_clock;
 // Runs the work on this thread, in the controller's memory, until so many seconds after it began.
 class Alone final : public Runner {
  public:
-  Alone(void* workspace, Clock::time_point begun, double seconds) : workspace_(workspace) {
-    if (seconds < 1e9) ends_ = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(seconds, 0.0)));
+  Alone(void* workspace, Clock::time_point begun, double seconds)
+      : workspace_(workspace), begun_(begun), seconds_(std::max(seconds, 0.0)) {
+    allot(1.0);
   }
 
   void run(const Kernels&, const MpcBatch&, bool to_the_end, Work work, void* context) override {
     work(context, workspace_, {to_the_end ? [](void*) { return false; } : &Alone::ask, this});
   }
   bool stopped() const override { return late_; }
+  void allot(double part) override {
+    if (seconds_ < 1e9) ends_ = begun_ + std::chrono::nanoseconds(int64_t(1e9 * part * seconds_));
+    late_ = late_ && Clock::now() >= ends_;
+  }
 
  private:
   static bool ask(void* context) {
@@ -32,6 +37,8 @@ class Alone final : public Runner {
   }
 
   void* workspace_;
+  const Clock::time_point begun_;
+  const double seconds_;
   Clock::time_point ends_ = Clock::time_point::max();
   bool late_ = false;
 };

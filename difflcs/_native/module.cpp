@@ -57,9 +57,15 @@ using Clock = std::chrono::steady_clock;
 
 struct Stop {
   std::atomic<int> ending{kGoOn};
+  const Clock::time_point begun = Clock::now();
+  const double seconds;
   Clock::time_point deadline = Clock::time_point::max();
-  explicit Stop(double seconds = std::numeric_limits<double>::infinity()) {
-    if (seconds < 1e9) deadline = Clock::now() + std::chrono::microseconds(int64_t(1e6 * std::max(seconds, 0.0)));
+  explicit Stop(double seconds = std::numeric_limits<double>::infinity()) : seconds(std::max(seconds, 0.0)) {
+    allot(1.0);
+  }
+  void allot(double part) {  // see Runner; of no thread that runs
+    if (seconds < 1e9) deadline = begun + std::chrono::microseconds(int64_t(1e6 * part * seconds));
+    if (ending == kOutOfTime && Clock::now() < deadline) ending = kGoOn;
   }
 };
 
@@ -245,6 +251,7 @@ struct Threads final : difflcs::Runner {
     if (mine.bytes <= kMostKept) std::swap(mine, kept.workspace);
   }
   bool stopped() const override { return stop.ending != kGoOn; }
+  void allot(double part) override { stop.allot(part); }
 };
 
 void check_plans(const difflcs::MpcBatch& b, int64_t x, int64_t u, int64_t lam, int64_t mu) {

@@ -53,6 +53,8 @@ constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
 // finds is then solved at the problem's own, whose kinks keep a plan where it begins.
 constexpr double kSoft = 1e-5, kSofter = 1000.0;
+// Of a limited time the search has this part, once the first starts are compared; the rest is for that.
+constexpr double kSearched = 0.6;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
@@ -297,8 +299,10 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
     if (effort.starts == 1)
       solve_once(searched, guess, effort, out, runner, first, count, hard ? kExplore : 0);
     else
-      search(searched, guess, effort, out, runner, first, count);
-    if (hard) harden(batch, effort, out, runner, first, count);
+      search(searched, batch.relaxation, guess, effort, out, runner, first, count);
+    if (!hard) continue;
+    runner.allot(1.0);
+    harden(batch, effort, out, runner, first, count);
   }
   for (const bool pivot : {false, true})
     if (!runner.stopped()) retry_failed(batch, effort, out, runner, pivot);
@@ -372,9 +376,9 @@ void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
     if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
 }
 
-// Solves them from several starts and keeps the best plan.
-void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-                       Runner& runner, int64_t first, int64_t count) {
+// Solves them from several starts and keeps the best plan. `target`: the relaxation that is wanted.
+void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
+                       const MpcPlans& out, Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
   const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
@@ -422,6 +426,7 @@ void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
       if (!sound || tried.objective[j] < tried.objective[b]) b = j;
     }
     begun = end;
+    if (batch.relaxation > target && begun >= std::min(kFixed, starts)) runner.allot(kSearched);
     if (begun < half || runner.stopped()) continue;
     const auto done = [&](int64_t e) { return settled(reached.data() + e * starts, begun); };
     live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
@@ -489,8 +494,10 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   if (!runner.stopped())
     solve([&](int64_t j) { return !solved(out.status[tried.owner[j]]) && !promises(j); });
   for (int64_t e = 0; e < count; e++) {
-    if (out.status[e] != kUnreached) continue;
-    if (best[e] >= 0) {  // out of time after its starts were compared
+    // Out of time after its starts were compared: one that was solved by chance need not be the best.
+    const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < out.objective[e];
+    if (out.status[e] != kUnreached && !(runner.stopped() && behind)) continue;
+    if (best[e] >= 0) {
       copy_plan(n, tried.plans(), best[e], out, e);
       out.status[e] = int8_t(Status::max_iter);
     } else {

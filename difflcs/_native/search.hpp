@@ -47,6 +47,8 @@ struct Runner {
   using Work = void (*)(void* context, void* workspace, Watch watch);
   virtual void run(const Kernels& kernels, const MpcBatch& batch, bool to_the_end, Work work, void* context) = 0;
   virtual bool stopped() const = 0;
+  // What follows may last until this part of the time is over.
+  virtual void allot(double part) = 0;
 
  protected:
   ~Runner() = default;
@@ -83,8 +85,8 @@ class MpcSearch {
   void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const;
   void solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                   Runner& runner, int64_t first, int64_t count, int64_t steps);
-  void search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-              Runner& runner, int64_t first, int64_t count);
+  void search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
+              const MpcPlans& out, Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                bool guessed);
   void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, int64_t best);

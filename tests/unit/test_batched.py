@@ -86,6 +86,15 @@ def test_a_plan_out_of_time_is_executed_at_the_relaxation(build, effort, time_li
     torch.testing.assert_close(plan.objective, cost, rtol=1e-7, atol=1e-9)
 
 
+def test_a_search_out_of_time_leaves_some_to_solve_its_plan_at_the_relaxation(build):
+    x0, goal = data(build, 1)
+    mpc = pushing(build, 5, restarts=1 << 14, time_limit=0.4, on_failure="mask")
+    mpc.relaxation = 1e-7
+    plan = mpc(x0, goal)
+    assert plan.converged.all()
+    assert plan.solve_time.sum() < 0.5
+
+
 # --- processors ------------------------------------------------------------------------------------------------------
 
 
