@@ -27,6 +27,8 @@ CORD = '<tendon><spatial limited="true" range="0 .3" {}><site site="hook"/><site
 FIXED = '<tendon><fixed limited="true" range="-1 {}" {}><joint joint="j" coef="1"/></fixed></tendon>'
 STILL = '<site name="hook"/><site name="eye" pos=".1 0 0"/>'
 MOTOR = '<actuator><motor joint="j"/></actuator>'
+LEVER = """<body pos="-.0155 9 .02"><joint type="slide" axis="1 0 0"/><geom size=".01" mass="1"/></body>
+  <body pos="0 9 0"><joint axis="0 1 0"/><geom type="box" size=".005 .01 .1" mass=".01"/></body>"""
 RESTING = {
     "drawer": (DRAWER.format(""), ""),
     "drawer of soft stops": (DRAWER.format('solreflimit=".05 1" solimplimit=".1 .9 .02"'), ""),
@@ -110,16 +112,16 @@ def test_what_moves_against_constraints_goes_as_in_mujoco(name):
 @pytest.mark.parametrize("force", [-2.0, -1.0, 1.0, 2.0])
 @pytest.mark.parametrize("case", [('frictionloss="3"', 0.01, 0.03), ('range="-60 .6"', 1.0, 0.1)])
 def test_friction_and_limits_stop_another_action_than_the_nominal_one(case, force):
-    """The nominal one has no force, so that friction, about the vertical, has little to do."""
+    """The nominal one has no force, so that friction, about the vertical, has little to do. Beside it a lever is hit."""
     words, speed, most = case
-    data = mujoco.MjData(model := load(hinge(words).replace('axis="0 1 0"', 'axis="0 0 1"'), MOTOR))
-    data.qvel[0] = speed
+    data = mujoco.MjData(model := load(hinge(words).replace('axis="0 1 0"', 'axis="0 0 1"') + LEVER, MOTOR))
+    data.qvel[:2] = speed, 1.0  # so that the lever turns 50 times as fast
     module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
     x = module.state.to_state(data.qpos, data.qvel)
     data.ctrl[:] = force
     after = module.params(x).step(x, torch.from_numpy(data.ctrl)).x_next
     mujoco.mj_step(model, data, 20)
-    assert float((after - module.state.to_state(data.qpos, data.qvel))[1].abs()) < most
+    assert float((after - module.state.to_state(data.qpos, data.qvel))[model.nv].abs()) < most
 
 
 def test_a_stiff_servo_that_presses_a_finger_against_its_limit_moves_neither_it_nor_the_arm():
