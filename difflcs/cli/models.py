@@ -62,10 +62,9 @@ class Evaluate:
         start = time.perf_counter()
         with closing(task.make_envs(max(1, min(EVALUATION_ENVS, goals)))) as envs:
             description = _describe_env(learned, task, envs)
-            with bar(goals * task.episode_steps, "evaluating") as shown:
-                result = evaluate(
-                    envs, learned.policy, goals, self.seed, task.episode_steps, *bounds, after_step=shown.update
-                )
+            policy, steps = learned.policy, task.episode_steps
+            with bar(goals * steps, "evaluating") as shown:
+                result = evaluate(envs, policy, goals, self.seed, steps, *bounds, shown.update, errors=task.errors)
         seconds = time.perf_counter() - start
         if self.plot is not None:
             draw_policy(learned.policy, task, self.plot, min(goals, EVALUATION_ENVS), self.seed)

@@ -70,10 +70,14 @@ A context (B, n_context), if the environment has one, is the third argument.
 """
 
 
-def action_bounds(env: VectorEnv) -> tuple[Tensor, Tensor]:
-    """Return the bounds (n_u,) of the action space, float64."""
+def action_bounds(env: VectorEnv, policy: object = None) -> tuple[Tensor, Tensor]:
+    """Return the bounds (n_u,) of the action space, float64, within those (n_u,) of a policy that has its own."""
     space: Any = env.single_action_space
-    return torch.from_numpy(np.asarray(space.low, np.float64)), torch.from_numpy(np.asarray(space.high, np.float64))
+    low, high = (torch.from_numpy(np.asarray(bound, np.float64)) for bound in (space.low, space.high))
+    own: list[Any] = [getattr(policy, name, None) for name in ("u_min", "u_max")]
+    if all(isinstance(bound, Tensor) and bound.shape == low.shape for bound in own):
+        low, high = (torch.clamp(bound.detach().double().cpu(), low, high) for bound in own)
+    return low, high
 
 
 def elapsed_fractions(episode_steps: int) -> Tensor:
@@ -108,9 +112,9 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     return act
 
 
-def uniform_actions(env: VectorEnv, rng: np.random.Generator) -> Act:
-    """Act uniformly at random within the action space."""
-    low, high = (bound.numpy() for bound in action_bounds(env))
+def uniform_actions(env: VectorEnv, rng: np.random.Generator, policy: object = None) -> Act:
+    """Act uniformly at random within `action_bounds`."""
+    low, high = (bound.numpy() for bound in action_bounds(env, policy))
     return lambda state, *_: (rng.uniform(low, high, (len(state), len(low))), np.zeros(len(state), bool))
 
 
@@ -125,17 +129,23 @@ def noisy_actions(act: Act, std: float, rng: np.random.Generator) -> Act:
 
 
 def collect(
-    env: VectorEnv, act: Act, seeds: Sequence[int], episode_steps: int, after_step: Callable[[], object] | None = None
+    env: VectorEnv,
+    act: Act,
+    seeds: Sequence[int],
+    episode_steps: int,
+    after_step: Callable[[], object] | None = None,
+    policy: object = None,
 ) -> TensorDict:
     """Run one episode per seed, in lockstep.
 
     Args:
         env: vector of environments with observation Dict(state, goal), or Dict(state, goal, context), and info
             "success"; at least as many as seeds.
-        act: chooses actions; they are clipped into the action space before they are executed and stored.
+        act: chooses actions; they are clipped into the `action_bounds` of env and policy, then executed and stored.
         seeds: reset seed of each episode; the environment draws the initial state and the goal from it.
         episode_steps: T, the length of every episode.
         after_step: called after every step.
+        policy: has bounds that hold besides those of the action space, as an `LCSMPCLayer` may.
 
     Returns:
         One episode per seed:
@@ -160,7 +170,7 @@ def collect(
 
     n = len(seeds)
     _check_env(env, n)
-    low, high = (bound.numpy() for bound in action_bounds(env))
+    low, high = (bound.numpy() for bound in action_bounds(env, policy))
     # A full reset with seeds clears Gymnasium's autoreset flags; surplus environments repeat the last episode, idle.
     padded = [*seeds, *[seeds[-1]] * (env.num_envs - n)]
     observation, _ = env.reset(seed=padded)  # pyright: ignore[reportArgumentType]  Gymnasium's vectors take a list

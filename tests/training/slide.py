@@ -118,9 +118,9 @@ def make_model(seed: int = 0) -> LCSModel:
     return lcs
 
 
-def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
+def make_mpc(lcs: LCSModule, u_max: float = U_MAX) -> LCSMPCLayer:
     cost = GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=3.0)
-    return LCSMPCLayer(lcs, cost, horizon=3, u_min=-U_MAX, u_max=U_MAX, on_failure="mask")
+    return LCSMPCLayer(lcs, cost, horizon=3, u_min=-u_max, u_max=u_max, on_failure="mask")
 
 
 def small_settings(**changes: Any) -> PPOSettings:

@@ -18,7 +18,9 @@ from tests.training.slide import (
     Slide,
     features,
     make_envs,
+    make_model,
     make_models,
+    make_mpc,
     make_ppo,
     parameters,
     recorded,
@@ -68,16 +70,17 @@ def test_what_no_episode_tests_is_handed_out_after_what_was_accepted():
         assert same(parameters(trainer), list(trainer.actor.learned.state_dict().values())) is first
 
 
-def test_the_policy_explores_and_the_environment_gets_clipped_actions():
-    trainer = make_ppo(std=0.2)
+def test_the_policy_explores_and_the_environment_gets_actions_clipped_into_the_bounds_of_the_mpc():
+    most = U_MAX / 2
+    trainer = make_ppo(std=0.2, controller=make_mpc(make_model(), most))
     seen = recorded(trainer)
     trainer.step()
     episodes = seen.calls[0][0]
     data = episodes["policy"]
     noise = (data["action"] - data["loc"]).flatten()
     assert float(noise.std()) == pytest.approx(0.2, rel=0.2)
-    torch.testing.assert_close(episodes["action"], data["action"].clamp(-U_MAX, U_MAX))
-    assert bool((data["action"].abs() > U_MAX).any())
+    torch.testing.assert_close(episodes["action"], data["action"].clamp(-most, most))
+    assert bool((data["action"].abs() > most).any())
 
 
 def test_rewards_are_limited_and_end_with_the_penalty():

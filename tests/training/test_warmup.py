@@ -59,6 +59,13 @@ def test_bounds_while_collecting():
     off.step()
     off.step()
     assert off.bounds == (off.low, off.high)
+    policy, most = Reach(off.lcs), torch.tensor([0.01]).double()
+    policy.u_min, policy.u_max = -most, most  # narrower than the environment's
+    own = Warmup(off.lcs, policy, make_envs(3), small_settings(action_support=9.0, noise=1.0), 0, STEPS)
+    for _ in range(2):  # at random, then by the MPC with noise
+        own.step()
+    assert own.buffer["action"].abs().max() == most
+    assert policy.bounds[-1] == (-most, most)
 
 
 def test_the_model_keeps_the_last_bounds_if_it_is_to():

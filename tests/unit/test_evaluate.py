@@ -9,7 +9,10 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs.errors import InvalidInputError
 from difflcs.rl.rollout import collect, mpc_actions
 from difflcs.rl.runs.evaluate import evaluate, wilson_interval
+from difflcs.rl.runs.training import TrainConfig, train
 from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.tasks import Quantity
+from tests.conformance.toy import make_task
 from tests.conftest import refuse
 from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
 
@@ -48,6 +51,14 @@ def test_broken_episodes_count_as_failures():
     assert result.successes == 0
     mixed = evaluate(SyncVectorEnv([lambda: PusherEnv(breaks_at=4), PusherEnv]), Reach(), 2, 0, STEPS)
     assert mixed.unstable == 1
+
+
+def test_an_error_of_the_task_that_is_never_reported_ends_the_evaluation(tmp_path):
+    errors = Quantity("position_error", "m"), Quantity("angle_error", "rad")
+    message = "expected angle_error in the info .* got position_error; report"
+    refuse(InvalidInputError, message, evaluate, make_envs(2), Reach(), 2, 0, STEPS, errors=errors)
+    config = TrainConfig("toy", 0.1, method="violation", final_goals=2)
+    refuse(InvalidInputError, message, train, config, tmp_path, task=make_task(errors=errors))
 
 
 def test_what_is_counted_is_what_the_episodes_say():

@@ -112,7 +112,7 @@ def test_what_moves_against_constraints_goes_as_in_mujoco(name):
 @pytest.mark.parametrize("force", [-2.0, -1.0, 1.0, 2.0])
 @pytest.mark.parametrize("case", [('frictionloss="3"', 0.01, 0.03), ('range="-60 .6"', 1.0, 0.1)])
 def test_friction_and_limits_stop_another_action_than_the_nominal_one(case, force):
-    """The nominal one has no force, so that friction, about the vertical, has little to do. Beside it a lever is hit."""
+    """The nominal one has no force, so that friction, about the vertical, has little to do; a lever is hit."""
     words, speed, most = case
     data = mujoco.MjData(model := load(hinge(words).replace('axis="0 1 0"', 'axis="0 0 1"') + LEVER, MOTOR))
     data.qvel[:2] = speed, 1.0  # so that the lever turns 50 times as fast

@@ -110,7 +110,7 @@ class PhysicsFit(EpisodeTrainer):
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
         noise = np.random.default_rng((self.seed, Stream.ACTION, self.iteration))
         if self.iteration < self.settings.random:
-            act = uniform_actions(self.env, noise)
+            act = uniform_actions(self.env, noise, self.policy)
         else:
             act = noisy_actions(mpc_actions(self.policy), self.settings.noise, noise)
         self.collect(act, count, after_step)

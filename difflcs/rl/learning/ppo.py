@@ -336,7 +336,7 @@ class PPO(Trainer):
         start = time.perf_counter()
         report = None if after_step is None else lambda: after_step(len(seeds))
         with seeded(key):
-            episodes = collect(env, act, seeds, self.episode_steps, report)
+            episodes = collect(env, act, seeds, self.episode_steps, report, self.policy)
         seconds = time.perf_counter() - start
         if not bool(episodes["stable"].any()):
             raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")

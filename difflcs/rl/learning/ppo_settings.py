@@ -145,7 +145,8 @@ def make_ppo(
     practice = None
     if models is not None:
         own = models.settings
-        many = MultiActionAdvantages(models.env, critic, features, scale, action_bounds(env), own.actions)
+        bounds = action_bounds(env, actor.controller)
+        many = MultiActionAdvantages(models.env, critic, features, scale, bounds, own.actions)
         part = many if own.actions > 1 else judge
         practice = Source(models.env, part, own.steps, settings.minibatch, own.value_epochs)
     incumbent = None

@@ -135,7 +135,7 @@ class EpisodeTrainer(Trainer):
         """Collect the next episodes of the training; the buffer then holds the newest `kept`, all if None."""
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         report, start = None if after_step is None else lambda: after_step(count), time.perf_counter()
-        self._newest = collect(self.env, act, seeds, self.episode_steps, report)
+        self._newest = collect(self.env, act, seeds, self.episode_steps, report, self.policy)
         self._times = start, time.perf_counter()
         self.episodes += count
         self.buffer = append_episodes(self.buffer, self._newest, kept)

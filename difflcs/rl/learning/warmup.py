@@ -199,7 +199,7 @@ class Warmup(EpisodeTrainer):
         needed = max(settings.rollouts.first, settings.rollouts.each)
         super().__init__(check_module(lcs, env), policy, seed, episode_steps, env, needed)
         self.lcs, self.settings, self.pretrained = lcs, settings, pretrained
-        self.low, self.high = action_bounds(env)
+        self.low, self.high = action_bounds(env, policy)
         self.bounds = (self.low, self.high)
         """Action bounds of the last collected episodes."""
         if isinstance(lcs, LCSModel):
@@ -228,7 +228,7 @@ class Warmup(EpisodeTrainer):
         random = self.iteration == 0 and not self.pretrained
         count = settings.rollouts.first if random else settings.rollouts.each
         if random:
-            act = uniform_actions(self.env, self._actions)
+            act = uniform_actions(self.env, self._actions, self.policy)
         else:
             if settings.action_support and len(self.buffer):
                 scale = settings.action_support * settings.action_support_growth ** (self.iteration - 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from difflcs.records import LCSModule, LCSParams
 from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
 from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.tasks import Quantity
 from difflcs.zoo import success_text
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def evaluate(
     after_step: Callable[[int], object] | None = None,
     delay: int = 0,
     model: LCSModule | LCSParams | None = None,
+    errors: Sequence[Quantity] = (),
 ) -> Evaluation:
     """Run one noise-free episode per goal; every solve starts cold.
 
@@ -122,9 +124,13 @@ def evaluate(
         delay: steps by which actions come late, see `difflcs.rl.runs.delay`.
         model: predicts the state at which a late action will be executed, such as `policy.lcs`; None: plans begin at
             the state as observed.
+        errors: those of the task, which the environment has to report.
 
     Returns:
         The success rate with its interval, and what went wrong.
+
+    Raises:
+        InvalidInputError: a number does not fit, or the environment does not report one of `errors`; see `collect`.
     """
     goals, seed = check_positive_int("goals", goals), check_positive_int("seed", seed, minimum=0)
     delay = check_positive_int("delay", delay, minimum=0)
@@ -140,7 +146,13 @@ def evaluate(
     successes = sum(int(part["success"].sum()) for part in parts)
     low, high = wilson_interval(successes, goals)
     names: Any = parts[0]["errors"].keys()  # pyright: ignore[reportAttributeAccessIssue]
-    errors = {name: torch.cat([part["errors", name].abs() for part in parts]) for name in sorted(names)}
+    reported = {name: torch.cat([part["errors", name].abs() for part in parts]) for name in sorted(names)}
+    unstable = sum(int((~part["stable"]).sum()) for part in parts)
+    if (missing := [e.name for e in errors if e.name not in reported]) and unstable < goals:
+        raise InvalidInputError(
+            f"env: expected {', '.join(missing)} in the info of its last step, as `errors` of the task has them, got "
+            f"{', '.join(reported) or 'none'}; report them under names that end in `_error`, or drop them from the task"
+        )
     return Evaluation(
         success_rate=successes / goals,
         ci_low=low,
@@ -148,8 +160,8 @@ def evaluate(
         successes=successes,
         goals=goals,
         seed=seed,
-        median_errors={name: float(values.nanquantile(0.5)) for name, values in errors.items()},
+        median_errors={name: float(values.nanquantile(0.5)) for name, values in reported.items()},
         solver_failures=sum(int(part["failures"].sum()) for part in parts),
         solves=goals * episode_steps,
-        unstable=sum(int((~part["stable"]).sum()) for part in parts),
+        unstable=unstable,
     )

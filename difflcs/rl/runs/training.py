@@ -175,7 +175,8 @@ def train(
         raise InvalidInputError(f"task: expected {config.task!r}, as the configuration says, got {spec.name!r}")
     out, init = config.directory() if out is None else Path(out), None if init is None else Path(init)
     check_path("out", out)
-    run = _Training(config, spec, out, make_envs or spec.make_envs, reporter or Reporter())
+    narrow = make_envs and (lambda count: spec.narrow(make_envs(count)))  # the task's own are narrow
+    run = _Training(config, spec, out, narrow or spec.make_envs, reporter or Reporter())
     if not force:
         with ExitStack() as held:
             return run(init, resume, lambda: None, held)
@@ -268,7 +269,7 @@ class _Training:
         state = load_checkpoint(run.checkpoints) if started else None
 
         def open_envs(count: int) -> VectorEnv:
-            self.opened.append(self.task.narrow(self.make_envs(count)))
+            self.opened.append(self.make_envs(count))
             _record_object(run, self.task.describe(self.opened[-1]))
             return self.opened[-1]
 
@@ -334,8 +335,8 @@ class _Training:
                 evaluation_envs.append(open_envs(min(EVALUATION_ENVS, max(config.evaluate_goals, config.final_goals))))
             ITERATIONS.info("evaluating %d goals", goals)
             reporter.evaluating(trainer.env_steps / per_minute, goals)
-            steps = self.task.episode_steps
-            return evaluate(evaluation_envs[0], trainer.policy, goals, config.evaluation_seed, steps)
+            seed, steps, errors = config.evaluation_seed, self.task.episode_steps, self.task.errors
+            return evaluate(evaluation_envs[0], trainer.policy, goals, seed, steps, errors=errors)
 
         def finish(report: Any, previous: int) -> None:
             # The row first, then the checkpoint: resuming drops rows after the checkpoint, so none is lost or doubled.
