@@ -27,7 +27,7 @@ struct Certificate {
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
   // Sizes of all states, and at one stage of the costates and of rho's response to them (conditions.py: `sizes`); terms
   // of both.
-  Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown;
+  Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown, *absolute;
   Vec* moved;                         // change of each state by the ranges of the earlier actions
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
@@ -54,7 +54,7 @@ struct Certificate {
     arena.take(u, h * nu);
     arena.take_all(h * nl, lam, gap);
     arena.take_all((h + 1) * nc, mu, row);
-    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown);
+    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown, absolute);
     arena.take_all(nl, y, rho, error, rows, rho_size, rho_terms);
     arena.take(N, nl * nl);
     arena.take(largest_action, nu);
@@ -275,17 +275,19 @@ struct Certificate {
         g.terms = max(g.terms, kCancelled * whole);
         action(k, j, uk[j], g);
       }
+      for (int64_t i = 0; i < nx; i++) absolute[i] = abs(p[i]);
       by_columns(0, nx, [&](int64_t i, auto kind) {
         using V = decltype(kind);
         const V first = read<V>(q, i);
-        SumOf<V> sum{first, abs(first)};
+        SumOf<V> sum{first, abs(first)}, cost{};  // side by side, so that neither waits for the other
         V along{}, through{};
         for (int64_t j = 0; j < nx; j++) {
-          const auto a = read<V>(A + j * nx, i), weight = read<V>(Q_t + j * nx, i);
-          sum.value += weight * xk[j];
-          sum.terms += abs(weight * size[j]);
-          sum.add(a * p[j]);
-          along += abs(a * p_size[j]);
+          const V a = read<V>(A + j * nx, i), weight = read<V>(Q_t + j * nx, i), size_of_a = abs(a);
+          cost.value += weight * xk[j];
+          cost.terms += abs(weight) * size[j];
+          sum.value += a * p[j];
+          sum.terms += size_of_a * absolute[j];
+          along += size_of_a * p_size[j];
         }
         for (int64_t j = 0; j < nl; j++) {
           const auto slope = read<V>(D + j * nx, i);
@@ -293,8 +295,8 @@ struct Certificate {
           through += abs(slope * rho_terms[j]);
         }
         for (int64_t m = 0; m < nc; m++) sum.add(read<V>(G_x + m * nx, i) * mk[m]);
-        write<V>(pn, i, sum.value);
-        write<V>(terms, i, sum.terms);
+        write<V>(pn, i, sum.value + cost.value);
+        write<V>(terms, i, sum.terms + cost.terms);
         write<V>(grown, i, max(along, through));
       });
       for (int64_t i = 0; i < nx; i++) {
@@ -321,15 +323,17 @@ struct Certificate {
       enter(k);
       const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
       const Vec* size = x_size + k * nx;
+      for (int64_t i = 0; i < nx; i++) absolute[i] = abs(xk[i]);
       by_columns(0, nx, [&](int64_t i, auto kind) {
         using V = decltype(kind);
         const V first = read<V>(d, i);
         SumOf<V> sum{first, abs(first)};
         V along{};
         for (int64_t j = 0; j < nx; j++) {
-          const auto a = read<V>(A_t + j * nx, i);
-          sum.add(a * xk[j]);
-          along += abs(a * size[j]);
+          const V a = read<V>(A_t + j * nx, i), size_of_a = abs(a);
+          sum.value += a * xk[j];
+          sum.terms += size_of_a * absolute[j];
+          along += size_of_a * size[j];
         }
         write<V>(pn, i, sum.value);
         write<V>(terms, i, sum.terms);

@@ -5,9 +5,8 @@ The work is done by the C++ class of `difflcs/_native/controller.hpp`, the same 
 
 import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -47,8 +46,7 @@ _CHANGES = {
 OnFailure = str | ArrayLike
 
 
-@dataclass(frozen=True)
-class ControllerPlan:
+class ControllerPlan(NamedTuple):
     """Last result of a controller's solver.
 
     Attributes:
