@@ -8,7 +8,7 @@ from difflcs.physics.frame import BodyFrameLCS
 from difflcs.physics.frame_search import Frame, find_frame
 from difflcs.physics.learnable import ContactLCS
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
-from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
+from difflcs.physics.shapes import Circle, NearestPoints, Polygon, Shape, Union, box
 
 if TYPE_CHECKING:  # for type checkers; MuJoCo is an extra, imported by the first use
     from difflcs.physics.mujoco import MujocoLCS as MujocoLCS
@@ -21,11 +21,11 @@ __all__ = [
     "Circle",
     "ContactLCS",
     "Contacts",
-    "Distance",
     "ForceDrive",
     "Frame",
     "FreeMotion",
     "Inertia",
+    "NearestPoints",
     "PDDrive",
     "PlanarPushing",
     "Polygon",

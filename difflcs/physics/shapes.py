@@ -24,7 +24,7 @@ from difflcs.errors import InvalidInputError
 _ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
 
 
-class Distance(NamedTuple):
+class NearestPoints(NamedTuple):
     """The points nearest to some points, one on each part of a shape.
 
     Attributes:
@@ -37,10 +37,10 @@ class Distance(NamedTuple):
     normal: Tensor
     point: Tensor
 
-    def select(self, parts: Tensor) -> "Distance":
+    def select(self, parts: Tensor) -> "NearestPoints":
         """Select parts (..., k) of each point."""
         rows = parts.unsqueeze(-1).expand(*parts.shape, 2)
-        return Distance(self.distance.gather(-1, parts), self.normal.gather(-2, rows), self.point.gather(-2, rows))
+        return NearestPoints(self.distance.gather(-1, parts), self.normal.gather(-2, rows), self.point.gather(-2, rows))
 
 
 class Moments(NamedTuple):
@@ -60,7 +60,7 @@ class Shape(ABC):
         return 1
 
     @abstractmethod
-    def distance(self, points: Tensor) -> Distance:
+    def distance(self, points: Tensor) -> NearestPoints:
         """Measure the distance to points (..., 2) in coordinates of the body."""
 
     @abstractmethod
@@ -138,7 +138,7 @@ class Polygon(Shape):
         """See `Shape`."""
         return float(self.vertices.detach().norm(dim=1).max())
 
-    def distance(self, points: Tensor) -> Distance:
+    def distance(self, points: Tensor) -> NearestPoints:
         """See `Shape`. Ties go to the side that comes first."""
         check_tensor("points", points, [("2", 2)])
         start, side, square, outward = self._sides()
@@ -157,7 +157,7 @@ class Polygon(Shape):
         safe = torch.where(beside, torch.ones_like(size), size)
         normal = torch.where(beside.unsqueeze(-1), outward, (sign / safe).unsqueeze(-1) * apart)
         distance = torch.where(beside, (apart * outward).sum(-1), sign * torch.where(beside, 1.0, size))
-        return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), point.unsqueeze(-2))
+        return NearestPoints(distance.unsqueeze(-1), normal.unsqueeze(-2), point.unsqueeze(-2))
 
     def _sides(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
@@ -211,7 +211,7 @@ class Circle(Shape):
         """See `Shape`."""
         return float(self.r.detach() + self.center.detach().norm())
 
-    def distance(self, points: Tensor) -> Distance:
+    def distance(self, points: Tensor) -> NearestPoints:
         """See `Shape`. In the very centre the normal points along x."""
         check_tensor("points", points, [("2", 2)])
         apart = points - self.center
@@ -220,7 +220,9 @@ class Circle(Shape):
         size = apart.norm(dim=-1)
         normal = apart / size.unsqueeze(-1)
         distance = torch.where(at_center, torch.zeros_like(size), size) - self.r
-        return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), (self.center + self.r * normal).unsqueeze(-2))
+        return NearestPoints(
+            distance.unsqueeze(-1), normal.unsqueeze(-2), (self.center + self.r * normal).unsqueeze(-2)
+        )
 
     def moments(self) -> Moments:
         """See `Shape`."""
@@ -256,11 +258,11 @@ class Union(Shape):
         """See `Shape`."""
         return max(part.radius for part in self.parts)
 
-    def distance(self, points: Tensor) -> Distance:
+    def distance(self, points: Tensor) -> NearestPoints:
         """See `Shape`."""
         distances = [part.distance(points) for part in self.parts]
         distance, normal, point = zip(*distances, strict=True)
-        return Distance(torch.cat(distance, -1), torch.cat(normal, -2), torch.cat(point, -2))
+        return NearestPoints(torch.cat(distance, -1), torch.cat(normal, -2), torch.cat(point, -2))
 
     def moments(self) -> Moments:
         """See `Shape`."""

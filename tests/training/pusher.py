@@ -16,20 +16,15 @@ U_MAX = 0.1
 
 def pusher() -> LCSParams:
     """A finger at x₁ pushes a block at x₀: x₀₊ = x₀ + λ, x₁₊ = x₁ + u, 0 ≤ λ ⊥ x₀ − x₁ − u + λ ≥ 0."""
-
-    def matrix(*rows):
-        return torch.tensor(rows, dtype=torch.float64)
-
-    zero = torch.zeros(1, dtype=torch.float64)
     return LCSParams(
-        A=matrix([1.0, 0.0], [0.0, 1.0]),
-        B=matrix([0.0], [1.0]),
-        C=matrix([1.0], [0.0]),
-        d=torch.zeros(2, dtype=torch.float64),
-        D=matrix([1.0, -1.0]),
-        E=matrix([-1.0]),
-        F=matrix([1.0]),
-        c=zero,
+        A=[[1.0, 0.0], [0.0, 1.0]],
+        B=[[0.0], [1.0]],
+        C=[[1.0], [0.0]],
+        d=[0.0, 0.0],
+        D=[[1.0, -1.0]],
+        E=[[-1.0]],
+        F=[[1.0]],
+        c=[0.0],
     )
 
 

@@ -124,7 +124,7 @@ def test_numbers_are_identified_by_mujocos_own_steps(motion, seconds, error):
     assert losses[-1] < losses[0]
     assert learned.change.tolist() == pytest.approx([0.1, 0.0, 0.0][: len(learn)], abs=error)
     refuse(ShapeError, "x: expected shape .* one state more", identify, learned, x[..., 1:, :], u)
-    refuse(ShapeError, "x, u: expected one motion or more of the same batch", identify, learned, x[1:], u)
+    refuse(ShapeError, "x, u: expected the same batch of one motion or more", identify, learned, x[1:], u)
     refuse(DTypeError, "module: expected LearnableMujocoLCS", identify, learned.physics, x, u)
     still = LearnableMujocoLCS(model, learn=[("torsional_friction", "block")], **options)
     with pytest.warns(ContactWarning, match=r"not depend on torsional_friction block"):

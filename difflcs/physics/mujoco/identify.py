@@ -1,4 +1,4 @@
-"""Numbers of a MuJoCo model from its motion: least squares between what was observed and MuJoCo's own steps."""
+"""System identification: numbers of a MuJoCo model are fitted to observed motion, by MuJoCo's own steps."""
 
 import warnings
 
@@ -21,36 +21,38 @@ _USER = mujoco.mjtState.mjSTATE_USER
 
 @takes_arrays
 def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int = 20) -> list[float]:
-    """Fit the parameters of a module to observed motion, by MuJoCo's own steps of the model that is learned.
+    """Fit the parameters of a module to observed motion, by simulating that motion with MuJoCo's own steps.
 
-    Each motion is simulated from its first state with the controls that were executed. Gauss–Newton steps make the sum
-    of log(1 + (e/s)²) small, over all numbers of all states, with s the median error of a number: neither impacts nor
-    other joints outweigh what a push tells (iteratively reweighted least squares with Cauchy's weights). Derivatives
-    are differences over the length of the last step, and what changes by more than it errs over that length counts
-    less. The compliance stays as it is, as it is not MuJoCo's.
+    Each motion is simulated from its first state with the controls that were executed. Gauss–Newton steps minimise the
+    sum of log(1 + (e/s)²) over all entries of all states, where e is the error of an entry and s its median over all
+    states. This robust loss (Cauchy's, by iteratively reweighted least squares) keeps impacts, and joints that are
+    predicted badly, from outweighing the rest. Derivatives are differences whose width is the length of the last step;
+    an entry that changes by more than its error over that width counts less. The compliance, which MuJoCo does not
+    have, is not fitted.
 
     Args:
-        module: the model, changed in place. Bodies that mocap moves, and applied forces, are as in its data.
-        x: (..., H + 1, n_x) observed states. Where states have no velocities, the first two actions bring these about,
-            from rest: they begin at the observed places, and what they lead to does not count, so H is 3 or more.
+        module: the model, changed in place. Mocap bodies and applied forces are as in its data.
+        x: (..., H + 1, n_x) observed states. States without velocities get them from the first two steps, which start
+            at rest, at the observed positions, and are not compared with what was observed: H is then 3 or more.
         u: (..., H, n_u) actions, which `MujocoLCS.control` converts to controls at the observed states.
-        iterations: most steps, of two simulations for each parameter and one to three more.
+        iterations: largest number of steps. A step simulates all motions twice for each parameter, and one to three
+            times more.
 
     Returns:
-        The mean of log(1 + (e/m)²) before each step, where m is the mean motion of a number of the state in a step.
+        The mean of log(1 + (e/m)²) before each step, where m is how much an entry changes in one step, on average.
 
     Raises:
-        InvalidInputError and its kinds: the arguments do not fit, or MuJoCo gives warnings in most of the motions.
+        InvalidInputError or a subclass: the arguments do not fit, or MuJoCo gives warnings in most of the motions.
 
     Warns:
-        ContactWarning: the motion does not depend on one of the parameters.
+        ContactWarning: the motion does not depend on one of the parameters, which stays as it was.
     """
-    check_kind("module", module, LearnableMujocoLCS, "learn others by violation_loss")
+    check_kind("module", module, LearnableMujocoLCS, "fit others by violation_loss")
     state, lead = module.state, 0 if module.state.velocities else _LEAD
     check_shape("u", u, f"... {lead + 1}+ n_u", {"n_u": module.n_u}, "take longer motions")
     check_shape("x", x, "... H n_x", {"H": u.shape[-2] + 1, "n_x": module.n_x}, "one state more than actions")
     if x.shape[:-2] != u.shape[:-2] or not u.numel():
-        raise ShapeError(f"x, u: expected one motion or more of the same batch, got {[*x.shape]} and {[*u.shape]}")
+        raise ShapeError(f"x, u: expected the same batch of one motion or more, got {[*x.shape]} and {[*u.shape]}")
     ctrl = to_numpy(module.control(x[..., :-1, :], u)).reshape(-1, *u.shape[-2:])
     begin = state.flatten(x, module._data.act).reshape(len(ctrl), u.shape[-2] + 1, -1)
     seen = state.to_state(*np.split(begin, [state.nq, state.nq + state.nv], -1))  # no rotation beyond half a turn
@@ -65,8 +67,8 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
     ways, (missed, broken) = torch.eye(len(at), dtype=at.dtype)[list(learned)], miss(at)
     if 2 * broken > len(begin):
         raise InvalidInputError(
-            f"x, u: expected motions that MuJoCo can simulate, got warnings of it in {broken} of {len(begin)}; see "
-            f"MUJOCO_LOG.TXT, take shorter ones, or begin with a better guess"
+            f"x, u: expected motions that MuJoCo can simulate, got its warnings in {broken} of {len(begin)}; see "
+            f"MUJOCO_LOG.TXT, pass shorter motions, or start from a better guess"
         )
     while len(losses) < check_positive_int("iterations", iterations) and reach > _LEAST:
         losses.append(float((missed / usual).square().log1p().mean()))
@@ -77,7 +79,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
         if len(losses) == 1 and (
             silent := [n for n, j in zip(learned.values(), J.unbind(-1), strict=True) if not j.any()]
         ):
-            said = f"the motion does not depend on {', '.join(silent)}, which stay as guessed; observe what shows them"
+            said = f"the motion does not depend on {', '.join(silent)}, which stay as they were; add motion that does"
             warnings.warn(said, ContactWarning, stacklevel=2)
         weighted = J / (1 + errors.square() + (reach * J).square().sum(-1)).unsqueeze(-1)
         A = torch.einsum("nti...,ntij->...j", J, weighted)

@@ -108,13 +108,13 @@ def evaluate(
 ) -> Evaluation:
     """Run one noise-free episode per goal; every solve starts cold.
 
-    Repeating it gives the same result bit for bit. A smaller evaluation uses the first goals of a larger one with the
+    The same call gives the same result bit for bit. A smaller evaluation uses the first goals of a larger one with the
     same seed. Another number of environments changes the solver's rounding (1e-15, which contact may amplify), and the
     random numbers of a policy that draws them for the whole batch, as PDDM does.
 
     Args:
         env: vector of environments, stepped in lockstep.
-        policy: the MPC.
+        policy: an `LCSMPCLayer`, or another policy that maps states and goals to actions, see `Policy`.
         goals: number of episodes.
         seed: of the goals and the initial states.
         episode_steps: steps of one episode.

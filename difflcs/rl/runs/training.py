@@ -144,16 +144,16 @@ def train(
 ) -> RunDirectory:
     """Train a model and leave a run directory behind.
 
-    It can be interrupted at any instant; resumed, it ends with the same parameters as if it had not been. The run
-    directory is locked meanwhile. The logger "difflcs" tells of iterations and evaluations, at level INFO.
+    It can be interrupted at any time: resumed, it ends with the same parameters as without the interruption. The run
+    directory is locked meanwhile. The logger "difflcs" reports iterations and evaluations at level INFO.
 
     Args:
         config: the configuration; LCS-RL on `task` by default. When resuming, it must equal that of the run.
         out: the run directory, new or empty unless resuming; runs/<task>-<method>-<seed> if None.
-        task: the task or its name, if the configuration does not say it or it is not registered.
-        make_envs: makes the environments; those of the task if None.
-        init: run or model directory, or model of the zoo ("zoo:NAME"), to start from, instead of a random model. A run
-            that is continued has its own.
+        task: the task or its name; beside a configuration it is needed only if its task is not registered.
+        make_envs: makes the environments, within the bounds of the task; those of the task if None.
+        init: run or model directory, or model of the zoo ("zoo:NAME"), to start from instead of a random model. A
+            resumed run keeps its own.
         resume: continue the run in `out`.
         force: replace the run in `out`. It is deleted once the new one has begun, and stays if that fails.
         reporter: for progress bars.
@@ -162,17 +162,18 @@ def train(
         The finished run.
 
     Raises:
-        InvalidInputError: no task has this name, its environment cannot be made, the data is used up by the warm-up,
-            `init` does not fit the task, an evaluation is to be after the end, or `force` and `resume`.
-        CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
-            they are no run, or they cannot be written; the last checkpoint is intact.
+        InvalidInputError: no task has this name, its environment cannot be made or does not report the task's errors,
+            the warm-up uses up the data, `init` does not fit the task, an evaluation would come after the end, or both
+            `force` and `resume` are set.
+        CheckpointError: `out` is not empty and neither `resume` nor `force` is set, or it is no run, or cannot be
+            resumed or written; its last checkpoint is intact.
         InUseError: another process trains in `out`.
         MissingDependencyError: TensorBoard is not installed.
     """
     spec = get_task(task or (TrainConfig() if config is None else config).task)
     config = TrainConfig(task=spec.name) if config is None else config
     if spec.name != config.task:
-        raise InvalidInputError(f"task: expected {config.task!r}, as the configuration says, got {spec.name!r}")
+        raise InvalidInputError(f"task: expected {config.task!r} as in config, got {spec.name!r}; make them the same")
     out, init = config.directory() if out is None else Path(out), None if init is None else Path(init)
     check_path("out", out)
     narrow = make_envs and (lambda count: spec.narrow(make_envs(count)))  # the task's own are narrow
@@ -252,7 +253,7 @@ class _Training:
         method.check(self.config.minutes)
         if init is not None and not method.takes_init:
             raise InvalidInputError(
-                f"init: expected none with method {method.name}, which learns networks instead of an LCSModel"
+                f"init: expected none with method {method.name}, which does not start from an LCSModel; leave it out"
             )
         reopened = None
         if resume:  # also a run that was stored before the other check existed
@@ -395,7 +396,7 @@ def _record_object(run: RunDirectory, current: Mapping[str, Any]) -> None:
             write_json(run.path / "config.json", {**config, "object": dict(current)})
     elif stored is not None and stored != dict(current):
         raise CheckpointError(
-            f"{run.path}: expected the environment it was started with, {stored}, got {dict(current)}; set up the same"
+            f"{run.path}: expected the environment it was started with, {stored}, got {dict(current)}; restore it"
         )
 
 
