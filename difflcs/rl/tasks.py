@@ -150,7 +150,8 @@ class TaskSpec:
         failure_penalty: penalty within that reward in the last step of an episode without success. Nothing is
             subtracted here: PPO must know how much of that one reward is not the cost of a step, see `RewardScale`.
         goal: names and units of the components of a goal.
-        errors: names and units of the errors in the environment's info; the names end in `_error`.
+        errors: names and units of the errors in the environment's info, which must have all of them after an episode;
+            the names end in `_error`.
         caption: the info of a step → the caption of its picture; None: the errors.
         picture: keyword arguments of the environment for pictures to be looked at, such as their size.
         example_goals: goals to show what was learned, the best one first.
