@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSMPCLayer, Status
-from difflcs.errors import InvalidInputError
-from difflcs.physics.mujoco import MujocoLCS
+from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.physics.mujoco import MujocoLCS, lcs_from_mujoco
 from tests.conftest import refuse
 
 SECONDS = (0.002, 0.02, 0.1)
@@ -209,3 +209,17 @@ def test_what_is_pressed_across_its_rail_has_friction(shape, depth, cone, speed)
     model.geom_contype[:] = 0
     for other in (*positions, MujocoLCS(model, data, motion="dynamic", pairs=[(0, 1)])):
         assert (other.contacts(torch.zeros(other.n_x, dtype=torch.float64)).gap >= 0).all()
+
+
+def test_a_light_object_that_goes_wrong_is_warned_of_beside_a_heavy_robot():
+    slides = '<joint name="x{0}" type="slide" axis="1 0 0"/><joint name="z{0}" type="slide" axis="0 0 1"/>'
+    model = load(
+        f"""<geom type="plane" size="1 1 .1"/><body name="box" pos="0 0 .03">{slides.format(0)}<joint axis="0 1 0"/>
+          <geom type="box" size=".03 .03 .03" mass=".05"/></body>
+        <body pos="-.038 0 .05">{slides.format(1)}<geom type="box" size=".01 .02 .04" mass="1"/></body>""",
+        """<actuator><position joint="x1" kp="100" kv="10" ctrlrange="-.1 .1"/>
+          <position joint="z1" kp="1000" kv="60" ctrlrange="-.2 .2"/></actuator>""",
+        option="",
+    )
+    with pytest.warns(ContactWarning, match="body 'box'"):
+        lcs_from_mujoco(model, mujoco.MjData(model), motion="dynamic", seconds=0.02)

@@ -161,25 +161,31 @@ def correct(
 def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:
     """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
+    Each tree of bodies counts by itself, as an object may be much lighter than the robot.
+
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
     without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
     """
     mass = np.linalg.inv(inverse_mass)
+    trees = model.dof_treeid == np.unique(model.dof_treeid)[:, None]
 
     def size(moved: Array) -> Array:
-        return np.sqrt(np.maximum((moved * (mass @ moved[..., None])[..., 0]).sum(-1), 0.0))
+        """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
+        energy = moved * (mass @ moved[..., None])[..., 0]
+        return np.sqrt(np.maximum(energy @ trees.T, 0.0))
 
     off, alone = predicted - after, np.nan_to_num(size(free - before), nan=np.inf).min(0)
-    least, change = _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2)), size(after - before)
+    least, change = _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ trees.T), size(after - before)
     alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
     moves = size(before) + alone
     most = change + _FARTHER * moves + least
     held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
     excess = size(off) - np.where(held, 0.0, most)
-    wrong = np.any(excess > 0, 0)
+    wrong = (excess > 0).any((0, 2))
     if wrong.any():
-        worst = np.unravel_index(np.nanargmax(excess), most.shape)
-        dof = int(np.argmax(np.abs(off[worst] * (mass[worst[1]] @ off[worst]))))
+        *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)
+        moved = off[tuple(worst)]
+        dof = int(np.argmax(np.abs(moved * (mass[worst[1]] @ moved)) * trees[tree]))
         joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
         warn(
             f"expected a system as near to MuJoCo's own step as standing still is, that moves where MuJoCo does, also "
