@@ -80,6 +80,17 @@ def action_bounds(env: VectorEnv, policy: object = None) -> tuple[Tensor, Tensor
     return low, high
 
 
+def check_env(env: object) -> Any:
+    """Raise unless an environment is a vector of some with observations Dict(state, goal)."""
+    space = getattr(env, "single_observation_space", None)
+    if not {"state", "goal"} <= {*getattr(space, "keys", tuple)()}:
+        raise InvalidInputError(
+            f"env: expected a VectorEnv with observations Dict(state, goal), got {describe(env)}, of {space}; use "
+            "gymnasium.vector.SyncVectorEnv([make] * 10), of environments with such observations"
+        )
+    return env
+
+
 def elapsed_fractions(episode_steps: int) -> Tensor:
     """(T + 1,) fraction of the episode that has passed at each state, from 0 to 1."""
     return torch.linspace(0, 1, episode_steps + 1, dtype=torch.float64)

@@ -39,9 +39,9 @@ Contexts (..., n_context) are the fourth argument where the environment gives an
 def compute_features(
     features: Features, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None
 ) -> Tensor:
-    """Compute the features of states, and of their contexts if there are any."""
+    """Compute the features of states, and of their contexts if there are any; raise if they are not finite."""
     seen = (state, goal, elapsed)
-    return features(*seen) if context is None else features(*seen, context)
+    return check_tensor("features", features(*seen) if context is None else features(*seen, context))
 
 
 def count_features(features: Features, *sizes: Sequence[int]) -> int:
@@ -207,7 +207,7 @@ class TaskSpec:
         check_number("failure_penalty", self.failure_penalty)
         for name in ("env", "make_cost", "features", "outcome", "describe"):
             value = getattr(self, name)
-            if not callable(value) and not (name == "env" and isinstance(value, str)):
+            if isinstance(value, GoalCost) or not (callable(value) or (name == "env" and isinstance(value, str))):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
         check_kind("physics", self.physics, (PhysicsSpec, type(None)), "wrap what makes the system in one")
         for name in ("u_min", "u_max"):

@@ -48,6 +48,7 @@ def test_evaluation_bounds():
 def test_broken_episodes_count_as_failures():
     result = evaluate(make_envs(2, breaks_at=4), Reach(), 2, 0, STEPS)
     assert result.unstable == 2
+    assert str(result).endswith(", 2 episodes unstable")
     assert result.successes == 0
     mixed = evaluate(SyncVectorEnv([lambda: PusherEnv(breaks_at=4), PusherEnv]), Reach(), 2, 0, STEPS)
     assert mixed.unstable == 1

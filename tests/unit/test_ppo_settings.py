@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from difflcs.errors import InvalidInputError
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import make_actor
@@ -23,6 +23,10 @@ def test_bad_arguments_are_refused():
     with pytest.raises(InvalidInputError, match="covariance='diagonal'"):
         make(actor, make_envs(), replace(settings, covariance="diagonal"), 0, **options)
     refuse(InvalidInputError, "shorten the warm-up", make, actor, make_envs(), settings, 0, **options, first_episode=20)
+    refuse(DTypeError, r"use LCSMPCPolicy\(", make, mpc, make_envs(), settings, 0, **options)
+    refuse(InvalidInputError, "env: expected a VectorEnv", make, actor, make_envs().envs[0], settings, 0, **options)
+    ppo = make(actor, make_envs(), settings, 0, **options | {"features": lambda *seen: features(*seen) / 0})
+    refuse(NonFiniteError, "features: expected finite", ppo.step)
     refuse(InvalidInputError, "std_range", replace, settings, std_range=(0.2, 0.1))
     bound = torch.full((1,), U_MAX)
     network = make_actor(MLPController(features, 3, -bound, bound, 4, STEPS), settings.std)

@@ -130,6 +130,7 @@ def test_what_a_picture_says():
         ({"env": 3}, DTypeError, "env"),
         ({"make_cost": None}, DTypeError, "make_cost"),
         ({"make_cost": lambda: 3}, DTypeError, "GoalCost"),
+        ({"make_cost": TOY.make_cost()}, DTypeError, "expected a function, got GoalCost"),
         ({"features": None}, DTypeError, "features"),
         ({"outcome": None}, DTypeError, "outcome"),
         ({"describe": None}, DTypeError, "describe"),

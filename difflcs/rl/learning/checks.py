@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from difflcs._checks import describe
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
+from difflcs.rl.rollout import check_env
 
 
 def check_module(lcs: object, env: VectorEnv | None = None, name: str = "lcs") -> nn.Module:
@@ -42,7 +43,7 @@ def check_module(lcs: object, env: VectorEnv | None = None, name: str = "lcs") -
             f"and none of that kind; make what is to be learned a torch.nn.Parameter"
         )
     if env is not None:
-        spaces: tuple[Any, Any] = (env.single_observation_space, env.single_action_space)
+        spaces: tuple[Any, Any] = (check_env(env).single_observation_space, env.single_action_space)
         wanted, got = (spaces[0]["state"].shape[0], spaces[1].shape[0]), (lcs.n_x, lcs.n_u)
         if got != wanted:
             raise InvalidInputError(

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from difflcs.errors import InvalidInputError
+from difflcs._checks import describe
+from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
 from difflcs.rl.learning.critic import Critic, CriticSettings
@@ -17,7 +18,7 @@ from difflcs.rl.learning.optim import AdamUpdate, Natural, NaturalUpdate, Update
 from difflcs.rl.learning.optim.update import Deviation
 from difflcs.rl.learning.ppo import PPO, Source
 from difflcs.rl.learning.surrogate import OUTLIER_KL, Surrogate
-from difflcs.rl.rollout import CONTEXT, action_bounds, has_context
+from difflcs.rl.rollout import CONTEXT, action_bounds, check_env, has_context
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Adam, Settings, ViolationLoss, bounded, group
 from difflcs.rl.tasks import Features, count_features
@@ -122,6 +123,8 @@ def make_ppo(
         InvalidInputError: an argument does not fit.
         MissingDependencyError: TorchRL is not installed.
     """
+    if not hasattr(actor, "learned"):
+        raise DTypeError(f"actor: expected a policy, got {describe(actor)}; use LCSMPCPolicy(mpc, settings.std)")
     lcs = isinstance(actor.learned, LCSModule | LCSParams | LCSSequence)
     if not lcs and (settings.beta < 1 or settings.update == "natural"):
         raise InvalidInputError(
@@ -133,7 +136,7 @@ def make_ppo(
             f"actor: expected one made with covariance={settings.covariance!r}, as the settings say, got "
             f"{actor.covariance!r}; use make_actor(controller, settings.std, settings.covariance)"
         )
-    space: Any = env.single_observation_space
+    space: Any = check_env(env).single_observation_space
     sizes = [space["state"].shape, space["goal"].shape, ()]
     if has_context(env):
         sizes.append(space[CONTEXT].shape)

@@ -14,7 +14,7 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.records import LCSModule, LCSParams
-from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
+from difflcs.rl.rollout import Policy, action_bounds, check_env, collect, mpc_actions
 from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
 from difflcs.rl.tasks import Quantity
@@ -55,12 +55,11 @@ class Evaluation:
     unstable: int
 
     def __str__(self) -> str:
-        return success_text(vars(self))
+        return success_text(vars(self)) + (f", {self.unstable} episodes unstable" if self.unstable else "")
 
     def summary(self) -> str:
         """Success and what went wrong, in one line."""
-        failures = f"success {self}, {self.solver_failures} of {self.solves} solves failed"
-        return failures + (f", {self.unstable} episodes unstable" if self.unstable else "")
+        return f"success {self}, {self.solver_failures} of {self.solves} solves failed"
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -130,12 +129,12 @@ def evaluate(
         The success rate with its interval, and what went wrong.
 
     Raises:
-        InvalidInputError: a number does not fit, or the environment does not report one of `errors`; see `collect`.
+        InvalidInputError: a number or the environment does not fit, or it does not report one of `errors`; see `collect`.
     """
     goals, seed = check_positive_int("goals", goals), check_positive_int("seed", seed, minimum=0)
     delay = check_positive_int("delay", delay, minimum=0)
     parts: list[TensorDict] = []
-    for first in range(0, goals, env.num_envs):
+    for first in range(0, goals, check_env(env).num_envs):
         count = min(env.num_envs, goals - first)
         report = None if after_step is None else lambda count=count: after_step(count)
         act = mpc_actions(policy, u_min, u_max)
