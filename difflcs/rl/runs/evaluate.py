@@ -129,7 +129,7 @@ def evaluate(
         The success rate with its interval, and what went wrong.
 
     Raises:
-        InvalidInputError: a number or the environment does not fit, or it does not report one of `errors`; see `collect`.
+        InvalidInputError: a number does not fit, or the environment, which reports each of `errors`; see `collect`.
     """
     goals, seed = check_positive_int("goals", goals), check_positive_int("seed", seed, minimum=0)
     delay = check_positive_int("delay", delay, minimum=0)
