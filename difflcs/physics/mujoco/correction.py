@@ -181,7 +181,7 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
     most = change + _FARTHER * moves + least
     held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
     excess = size(off) - np.where(held, 0.0, most)
-    wrong = (excess > 0).any((0, 2))
+    wrong = np.any(excess > 0, (0, 2))
     if wrong.any():
         *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)
         moved = off[tuple(worst)]
