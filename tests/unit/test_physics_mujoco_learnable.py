@@ -126,8 +126,9 @@ def test_numbers_are_identified_by_mujocos_own_steps(motion, seconds, error):
     refuse(ShapeError, "x: expected shape .* one state more", identify, learned, x[..., 1:, :], u)
     refuse(ShapeError, "x, u: expected the same batch of one motion or more", identify, learned, x[1:], u)
     refuse(DTypeError, "module: expected LearnableMujocoLCS", identify, learned.physics, x, u)
-    still = LearnableMujocoLCS(model, learn=[("torsional_friction", "block")], **options)
-    with pytest.warns(ContactWarning, match=r"not depend on torsional_friction block"):
+    still = LearnableMujocoLCS(model, learn=[("torsional_friction", "block"), ("friction", "floor")], **options)
+    still.change.data[1] = 2.0  # more than that of the block, and so too much; below that it has no effect
+    with pytest.warns(ContactWarning, match="not depend on torsional_friction block, friction floor near"):
         identify(still, x, u)
 
 

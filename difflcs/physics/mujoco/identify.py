@@ -1,7 +1,5 @@
 """System identification: numbers of a MuJoCo model are fitted to observed motion, by MuJoCo's own steps."""
 
-import warnings
-
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -9,12 +7,13 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_kind, check_positive_int, check_shape, takes_arrays
-from difflcs.errors import ContactWarning, InvalidInputError, ShapeError
+from difflcs.errors import ContactWarning, InvalidInputError, ShapeError, warn
 from difflcs.physics.mujoco.learnable import Array, LearnableMujocoLCS, slope
 from difflcs.physics.mujoco.native import to_numpy
 
 _REACH, _LEAST = 0.3, 4e-3  # over which differences are taken: at first, and when it is done
 _FLOOR = 0.01  # least error of a number of the state, in parts of its mean motion in a step, that counts
+_ROUNDING = 1e-6  # change of any entry, in parts of its error, per e-fold of a parameter, that is only rounding
 _LEAD = 2  # actions that bring about the velocities of states without any
 _USER = mujoco.mjtState.mjSTATE_USER
 
@@ -45,7 +44,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
         InvalidInputError or a subclass: the arguments do not fit, or MuJoCo gives warnings in most of the motions.
 
     Warns:
-        ContactWarning: the motion does not depend on one of the parameters, which stays as it was.
+        ContactWarning: the motion does not depend on one of the parameters near the value found.
     """
     check_kind("module", module, LearnableMujocoLCS, "fit others by violation_loss")
     state, lead = module.state, 0 if module.state.velocities else _LEAD
@@ -63,7 +62,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
         return after - seen, broken
 
     learned = {s + k: f"{kind} {name}" for kind, name, ids, s, n in module._entries for k in range(n) if ids}
-    at, reach, losses = module.change.detach().clone(), _REACH, []
+    at, reach, losses, silent = module.change.detach().clone(), _REACH, [], []
     ways, (missed, broken) = torch.eye(len(at), dtype=at.dtype)[list(learned)], miss(at)
     if 2 * broken > len(begin):
         raise InvalidInputError(
@@ -76,11 +75,7 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
         errors = missed / scale
         ends = [[(miss(at + sign * reach * way)[0] - missed) / scale for sign in (1, -1)] for way in ways]
         J = torch.stack([slope(*both) for both in ends], -1) / reach
-        if len(losses) == 1 and (
-            silent := [n for n, j in zip(learned.values(), J.unbind(-1), strict=True) if not j.any()]
-        ):
-            said = f"the motion does not depend on {', '.join(silent)}, which stay as they were; add motion that does"
-            warnings.warn(said, ContactWarning, stacklevel=2)
+        silent = [n for n, j in zip(learned.values(), J.unbind(-1), strict=True) if j.abs().max() < _ROUNDING]
         weighted = J / (1 + errors.square() + (reach * J).square().sum(-1)).unsqueeze(-1)
         A = torch.einsum("nti...,ntij->...j", J, weighted)
         step = torch.linalg.solve(A + (1e-6 * A.diag() + 1e-9).diag(), -torch.einsum("ntij,nti->j", weighted, errors))
@@ -92,6 +87,9 @@ def identify(module: LearnableMujocoLCS, x: Tensor, u: Tensor, iterations: int =
                 break
             least, missed, at = value, other, start + length * step
         reach = min(_REACH, max(float((at - start).abs().max()), reach / 3))
+    if silent:
+        said = f"the motion does not depend on {', '.join(silent)} near the values found, which may be wrong"
+        warn(f"{said}; add motion that does", ContactWarning)
     with torch.no_grad():
         module.change.copy_(at)
     return losses
