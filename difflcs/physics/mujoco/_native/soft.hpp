@@ -23,12 +23,10 @@ class SoftForces {
   bool solve(const double* J, const double* R, const double* q, double compliance, const double* low,
              const double* high, double* force) {
     factor(R);
+    std::fill(K_.begin(), K_.end(), 0.0);
     for (int i = 0; i < m_; i++)
-      for (int j = 0; j < n_; j++) {
-        double sum = 0;
-        for (int k = j; k < n_; k++) sum += J[i * n_ + k] * L_[k * n_ + j];
-        K_[i * n_ + j] = sum;
-      }
+      for (int k = 0; k < n_; k++)
+        if (J[i * n_ + k] != 0) add(J[i * n_ + k], &L_[k * n_], k + 1, &K_[i * n_]);
     c_ = compliance;
     low_ = low;
     high_ = high;
@@ -63,52 +61,54 @@ class SoftForces {
 
   double clip(int i, double y) const { return std::clamp(-y / c_, low_[i], high_[i]); }
 
-  // R = L Lᵀ, with columns of zeros where R has none of its own.
+  // into += factor · row, of so many numbers: what a compiler can do side by side.
+  static void add(double factor, const double* row, int count, double* __restrict into) {
+    for (int k = 0; k < count; k++) into[k] += factor * row[k];
+  }
+
+  // Overwrite the upper triangle of H by U with Uᵀ U = H, with rows of zeros where pivots are no more than `least`.
+  void factor_upper(double least) {
+    for (int j = 0; j < n_; j++) {
+      double* row = &H_[j * n_];
+      const double root = row[j] > least ? std::sqrt(row[j]) : 0.0;
+      for (int k = j; k < n_; k++) row[k] = root > 0 ? row[k] / root : 0.0;
+      for (int i = j + 1; i < n_; i++)
+        if (row[i] != 0) add(-row[i], row + i, n_ - i, &H_[i * n_ + i]);
+    }
+  }
+
+  // R = L Lᵀ.
   void factor(const double* R) {
+    std::copy_n(R, n_ * n_, H_.begin());
     double most = 0;
     for (int j = 0; j < n_; j++) most = std::max(most, R[j * n_ + j]);
-    std::fill(L_.begin(), L_.end(), 0.0);
-    for (int j = 0; j < n_; j++) {
-      double pivot = R[j * n_ + j];
-      for (int k = 0; k < j; k++) pivot -= L_[j * n_ + k] * L_[j * n_ + k];
-      if (!(pivot > 1e-15 * most)) continue;
-      const double root = std::sqrt(pivot);
-      for (int i = j; i < n_; i++) {
-        double sum = R[i * n_ + j];
-        for (int k = 0; k < j; k++) sum -= L_[i * n_ + k] * L_[j * n_ + k];
-        L_[i * n_ + j] = sum / root;
-      }
-    }
+    factor_upper(1e-15 * most);
+    for (int j = 0; j < n_; j++)
+      for (int i = j; i < n_; i++) L_[i * n_ + j] = H_[j * n_ + i];
   }
 
   // Newton's direction: (1 + Kᵀ K/c over the rows inside) way = Kᵀ λ − s.
   void direct() {
     for (int j = 0; j < n_; j++) {
       way_[j] = -s_[j];
-      std::fill_n(&H_[j * n_], j, 0.0);
+      std::fill_n(&H_[j * n_ + j], n_ - j, 0.0);
       H_[j * n_ + j] = 1.0;
     }
     for (int i = 0; i < m_; i++) {
       const double* row = &K_[i * n_];
       const double force = clip(i, y_[i]);
-      for (int j = 0; force != 0 && j < n_; j++) way_[j] += row[j] * force;
-      for (int j = 0; inside_[i] && j < n_; j++) {
-        const double scaled = row[j] / c_;
-        for (int k = 0; k <= j; k++) H_[j * n_ + k] += scaled * row[k];
-      }
+      if (force != 0) add(force, row, n_, way_.data());
+      for (int j = 0; inside_[i] && j < n_; j++)
+        if (row[j] != 0) add(row[j] / c_, row + j, n_ - j, &H_[j * n_ + j]);
     }
+    factor_upper(0.0);
     for (int j = 0; j < n_; j++) {
-      for (int k = 0; k <= j; k++) {
-        double sum = H_[j * n_ + k];
-        for (int l = 0; l < k; l++) sum -= H_[j * n_ + l] * H_[k * n_ + l];
-        H_[j * n_ + k] = k < j ? sum / H_[k * n_ + k] : std::sqrt(sum);
-      }
-      for (int k = 0; k < j; k++) way_[j] -= H_[j * n_ + k] * way_[k];
       way_[j] /= H_[j * n_ + j];
+      add(-way_[j], &H_[j * n_ + j] + 1, n_ - j - 1, &way_[j] + 1);
     }
     for (int j = n_ - 1; j >= 0; j--) {
+      for (int k = j + 1; k < n_; k++) way_[j] -= H_[j * n_ + k] * way_[k];
       way_[j] /= H_[j * n_ + j];
-      for (int k = 0; k < j; k++) way_[k] -= H_[j * n_ + k] * way_[j];
     }
     for (int i = 0; i < m_; i++) {
       dy_[i] = 0;
