@@ -157,6 +157,12 @@ class _Record(SystemMatrices):
         vars(record).update(tensors, _checked=_numbers_of(tensors["F"]))
         return record
 
+    def with_checked(self, **tensors: Tensor) -> Self:
+        """Return this record with other tensors in place of some, but not of F; nothing is checked here."""
+        record = object.__new__(type(self))
+        vars(record).update(vars(self) | tensors)
+        return record
+
     @classmethod
     def of_fitting(cls, tensors: Mapping[str, Tensor]) -> Self:
         """Make a record of all its tensors, whose shapes and dtypes fit each other; only the numbers are checked."""

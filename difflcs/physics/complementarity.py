@@ -263,8 +263,11 @@ def assemble_lcs(
     rows, normals = rows / length, normals / length
     F = rows @ C
     n_lam = F.shape[-1]
-    one = torch.eye(n_lam, dtype=F.dtype, device=F.device) if of is torch else np.eye(n_lam)
-    F = 0.5 * (F + F.swapaxes(-1, -2)) + softness[..., None] * one
+    F = 0.5 * (F + F.swapaxes(-1, -2))
+    if of is torch:
+        F = F + torch.diag_embed(softness)
+    else:
+        F[..., np.arange(n_lam), np.arange(n_lam)] += softness
     D = rows @ free.A - (rows - normals)
     c = gap / length + _apply(rows, free.d) - _apply(normals, x)
     forces = np.arange(n_lam)
@@ -276,11 +279,10 @@ def assemble_lcs(
     system = _Rows(*changed)
     if stewart_trinkle:
         system = _limit_friction(system, torch.as_tensor(mu), each, torch.from_numpy(forces).to(system.F.device))
-    if bounded is not None and bounded.offset.shape[-1]:
-        system = _bound(system, *(torch.as_tensor(v / force) for v in (bounded.lower, bounded.upper)))
-    if caps is not None and n_caps:
-        of_cap = torch.arange(n_caps).repeat_interleave(each)
-        system = _hold(system, torch.arange(n_caps * each), of_cap, torch.as_tensor(caps / force))
+    if n_caps or (bounded is not None and bounded.offset.shape[-1]):
+        none = system.c[..., :0]
+        low, high = (none, none) if bounded is None else (torch.as_tensor(v / force) for v in bounded[2:4])
+        system = _bound(system, low, high, none if caps is None else torch.as_tensor(caps / force), each)
     return {"A": A, "B": B, **system._asdict()}
 
 
@@ -295,35 +297,32 @@ class _Rows(NamedTuple):
     c: Tensor
 
 
-def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
-    """Give the last forces, of any sign in `system`, their bounds: they become λ + lower, and s is added."""
-    C, d, D, E, F, c = system
-    n, n_lam = lower.shape[-1], F.shape[-1]
-    d, c = d + matvec(C[..., -n:], lower), c + matvec(F[..., -n:], lower)
-    return _hold(_Rows(C, d, D, E, F, c), torch.arange(n_lam - n, n_lam), torch.arange(n), upper - lower)
+def _bound(system: _Rows, lower: Tensor, upper: Tensor, caps: Tensor, each: int) -> _Rows:
+    """Give the last forces, of any sign in `system`, their bounds: they become λ + lower, and s is added.
 
-
-def _hold(system: _Rows, forces: Tensor, groups: Tensor, most: Tensor) -> _Rows:
-    """Let the sum of each group of forces be at most so large (..., n): s is added, one for each group.
-
-    `forces` are numbers of multipliers, in the order of their `groups`. See `Bounded`: 0 ≤ s ⊥ most − Σ λ + ε s ≥ 0.
+    And the first contacts, of `each` so many forces, caps of their sum (..., n_caps), by σ after s. For both see
+    `Bounded`: 0 ≤ s ⊥ most − Σ λ + ε s ≥ 0.
     """
     C, d, D, E, F, c = system
-    n = most.shape[-1]
-    held = F.new_zeros(F.shape[-1], n)
-    held[forces, groups] = 1.0
-    drag = torch.diag_embed(_DRAG / F.diagonal(dim1=-2, dim2=-1)[..., forces[:: len(forces) // n]])
-    held = held.expand(*F.shape[:-1], n)
-    F = torch.cat([torch.cat([F, held], -1), torch.cat([-held.mT, drag], -1)], -2)
+    n, n_caps, n_lam = lower.shape[-1], caps.shape[-1], F.shape[-1]
+    d, c = d + matvec(C[..., n_lam - n :], lower), c + matvec(F[..., n_lam - n :], lower)
+    most, last = _join(-1, upper - lower, caps), torch.arange(n_lam - n, n_lam)
+    forces = torch.cat([last, torch.arange(n_caps * each)])
+    groups = n_lam + torch.cat([torch.arange(n), n + torch.arange(n_caps).repeat_interleave(each)])
+    added, first = n_lam + torch.arange(n + n_caps), torch.cat([last, torch.arange(0, n_caps * each, each)])
+    larger = F.new_zeros(*F.shape[:-2], n_lam + n + n_caps, n_lam + n + n_caps)
+    larger[..., :n_lam, :n_lam] = F
+    larger[..., forces, groups], larger[..., groups, forces] = 1.0, -1.0
+    larger[..., added, added] = _DRAG / F.diagonal(dim1=-2, dim2=-1)[..., first]
     C, D, E = (
         torch.cat([v, v.new_zeros(shape)], dim)
         for v, shape, dim in (
-            (C, (*C.shape[:-1], n), -1),
-            (D, (*D.shape[:-2], n, D.shape[-1]), -2),
-            (E, (*E.shape[:-2], n, E.shape[-1]), -2),
+            (C, (*C.shape[:-1], n + n_caps), -1),
+            (D, (*D.shape[:-2], n + n_caps, D.shape[-1]), -2),
+            (E, (*E.shape[:-2], n + n_caps, E.shape[-1]), -2),
         )
     )
-    return _Rows(C, d, D, E, F, _join(-1, c, most))
+    return _Rows(C, d, D, E, larger, _join(-1, c, most))
 
 
 def _join(dim: int, *parts: Any) -> Any:
