@@ -8,15 +8,20 @@ the ranges of the actuators and within `action_bounds`. Medians are told for sta
 contact, or where a joint or tendon is at its limit in this step. Beside them are those of differences: MuJoCo's own
 steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included. Both are also told with a
 nominal control near the action, nine tenths of the way, as that of a plan's next pass is.
+
+With `--times` only the CPU time of a state in one batch is told, of each motion and of MuJoCo's own steps, in turn.
 """
 
 import importlib.util
 import re
 import time
 import warnings
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
@@ -26,8 +31,10 @@ import tyro
 from difflcs.cli.bench import machine, save
 from difflcs.errors import DiffLCSError
 from difflcs.physics.mujoco import MujocoLCS
+from difflcs.physics.mujoco.lcs import Motion
 
 SECONDS = 0.02  # of a step
+ROUNDS = 10  # in which each motion takes its turn; the first does not count
 NEAR = 0.9  # of the way from the usual nominal control to the action
 MODELS = {  # package → its scenes; what does not load alone, or has no joint, is a part of others
     "dm_control": ["suite/*.xml"],
@@ -67,6 +74,8 @@ class Options:
     """States of a model."""
     seed: int = 0
     """Seed of motions and controls."""
+    times: bool = False
+    """Times alone."""
     out: Path = Path("benchmarks/results/physics_models.json")
     """Where the JSON goes."""
 
@@ -157,7 +166,7 @@ class Simulated:
 
 
 @torch.no_grad()
-def measure(model: Any, o: Options, asked: dict[str, int] | None = None) -> dict[str, Any] | None:
+def measure(model: Any, o: Options, asked: dict[str, Any] | None = None) -> dict[str, Any] | None:
     """Errors by kind, and the time of a state, with as many contacts and limits as a `ContactWarning` asks for.
 
     None where every simulation of the model diverges.
@@ -212,9 +221,32 @@ def measure(model: Any, o: Options, asked: dict[str, int] | None = None) -> dict
     return {"ms": 1e3 * seconds, "n_x": module.n_x, "n_u": module.n_u, "n_lam": module.n_lam, **told}
 
 
+def clock(model: Any, o: Options) -> dict[str, Any] | None:
+    """Median CPU times of a state [µs], in one batch of all, by motion; "mujoco": its own steps one by one."""
+    states, data, steps = roam(model, o.states, np.random.default_rng(o.seed)), mujoco.MjData(model), count_steps(model)
+
+    def simulate() -> None:
+        for data.qpos[:], data.qvel[:], data.act[:] in states:
+            mujoco.mj_step(model, data, steps)
+
+    ways: dict[str, Callable[[], Any]] = {"mujoco": simulate}
+    for motion in get_args(Motion) if states else ():
+        with suppress(DiffLCSError):
+            module = MujocoLCS(model, motion=motion, seconds=steps * model.opt.timestep)
+            ways[motion] = partial(module.params, torch.stack([module.state.to_state(*state) for state in states]))
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(ROUNDS):
+        for name, way in ways.items():
+            start = time.process_time()
+            way()
+            times[name].append(1e6 * (time.process_time() - start) / len(states))
+    return {name: float(np.median(each[1:])) for name, each in times.items()} if len(ways) > 1 else None
+
+
 def main(o: Options) -> None:
     """Measure, print, write."""
     torch.set_num_threads(1)
+    o.out = o.out.with_stem(f"{o.out.stem}_times") if o.times else o.out
     results: dict[str, dict[str, Any]] = {}
     for package, paths in find(o.packages).items():
         for path in paths:
@@ -231,14 +263,14 @@ def main(o: Options) -> None:
             with warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 try:
-                    row = measure(model, o)
+                    row = clock(model, o) if o.times else measure(model, o)
                 except DiffLCSError as error:
                     row = {"refused": str(error)}
             if row is None:
                 continue
             row |= {"warnings": sorted({str(w.message) for w in said})}
             results[name] = row
-            print(name, row.get("refused") or describe(row), flush=True)
+            print(name, row.get("refused") or (row if o.times else describe(row)), flush=True)
     options = {"states": o.states, "seed": o.seed, "seconds": SECONDS}
     save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})
 

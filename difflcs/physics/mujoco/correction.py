@@ -116,8 +116,10 @@ def correct(
     known = np.isfinite(change).all(1, keepdims=True)
     change = np.where(known, change, 0.0)
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
-    trees, tree = np.unique(step.motion.tree, return_inverse=True)
-    mass = (tree[:, None] == np.arange(len(trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
+    tree = step.motion.of_tree
+    mass = (tree[:, None] == np.arange(len(step.motion.trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[
+        :, :, None
+    ]
 
     def size(moved: NDArray[Any]) -> Array:
         """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""

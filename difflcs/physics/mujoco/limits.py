@@ -12,6 +12,7 @@ far friction creeps, when in the step the force acts, and whether it does so all
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -52,7 +53,7 @@ class Softness(NamedTuple):
 
     def yields(self, mass: Array | float, seconds: float) -> Array:
         """Speed (n, k) for a unit of force at which friction that holds creeps after a time, where A is `mass`."""
-        d = _impedance(np.zeros_like(self.give), self.impedance)
+        d = _find_impedance(self.impedance)(np.zeros_like(self.give))
         firm = (1 - d) / d * self.give
         rate = self.damping * mass / np.maximum(mass + firm, 1e-300)
         return firm / self.damping * -np.expm1(-rate * seconds)
@@ -346,8 +347,9 @@ def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float,
     r, v, held, holds = gap.copy(), speed.copy(), np.ones_like(limit), np.ones_like(limit)
     way = np.zeros((2, *gap.shape))  # by the force, and by the load
     rate, total = np.zeros_like(way), np.zeros_like(gap)
+    impedance = _find_impedance(soft.impedance)
     for i in range(count):
-        d = _impedance(np.where(limit, np.abs(r), 0.0), soft.impedance)
+        d = impedance(np.where(limit, np.abs(r), 0.0))
         firm = mass / (mass + (1 - d) / d * soft.give)
         spring, damping = firm * soft.stiffness * d, firm * (soft.damping - drag)
         if coarse:  # steps that are longer than MuJoCo's are implicit
@@ -369,13 +371,18 @@ def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float,
     return Followed(r - gap, v, part, acts, holds, held)
 
 
-def _impedance(depth: Array, parameters: Array) -> Array:
-    """Compute MuJoCo's impedance d of (...) depths with solimp (..., 5)."""
-    least, most, width, middle, power = np.moveaxis(parameters, -1, 0)
-    x = np.minimum(depth / np.maximum(width, 1e-15), 1.0)
-    middle, power = np.clip(middle, 1e-4, 0.9999), np.maximum(power, 1.0)
-    y = np.where(x <= middle, x**power / middle ** (power - 1), 1 - (1 - x) ** power / (1 - middle) ** (power - 1))
-    return np.clip(least + y * (most - least), 1e-4, 0.9999)
+def _find_impedance(parameters: Array) -> Callable[[Array], Array]:
+    """Return MuJoCo's impedance d as a function of depths (...), for solimp (..., 5)."""
+    least, most, width, middle, power = (parameters[..., i] for i in range(5))
+    width, middle, power = np.maximum(width, 1e-15), middle.clip(1e-4, 0.9999), np.maximum(power, 1.0)
+    below, above = middle ** (power - 1), (1 - middle) ** (power - 1)
+
+    def impedance(depth: Array) -> Array:
+        x = np.minimum(depth / width, 1.0)
+        y = np.where(x <= middle, x**power / below, 1 - (1 - x) ** power / above)
+        return (least + y * (most - least)).clip(1e-4, 0.9999)
+
+    return impedance
 
 
 def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -> tuple[Array, Array]:

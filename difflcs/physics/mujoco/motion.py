@@ -150,6 +150,7 @@ class Dynamic:
         self._models: list[Any] = []
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
+        self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
         self.firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
@@ -449,7 +450,8 @@ class DynamicStep(NamedTuple):
     def reached(self, carried: Array) -> list[Array]:
         """Return ζ and ν (n, nv) afterwards with the nominal action, with `carried` added to motion without contact."""
         after = self.step[:, : carried.shape[1]] + carried
-        return np.split(_reached(after, self.velocity), 2, -1)
+        reached, nv = _reached(after, self.velocity), self.place.shape[1]
+        return [reached[:, :nv], reached[:, nv:]]
 
     def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
         """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""

@@ -24,7 +24,7 @@ from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Followed, Rows, ScaledRows, find_load, follow, give_way, scale
-from difflcs.physics.mujoco.motion import DynamicStep
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
@@ -227,7 +227,8 @@ def _settle(at: Situation, at_once: NDArray[np.bool_]) -> tuple[ScaledRows, Arra
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
     load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
     # The same with the action that presses a limit most.
-    far, fast = (rows.normal @ by for by in np.split(step.step[:, : 2 * nv, step.x.shape[1] : -1], 2, 1))
+    by_action = step.step[:, :, step.x.shape[1] : -1]
+    far, fast = rows.normal @ by_action[:, :nv], rows.normal @ by_action[:, nv : 2 * nv]
     faster = np.abs(fast) @ step.motion.actuators.reach
     harder = np.stack([np.zeros_like(faster), faster]) * (1 + h * load.drag) / h
     gap, load = np.broadcast_to(rows.gap, harder.shape), load._replace(acceleration=load.acceleration - harder)
@@ -365,17 +366,18 @@ def _compute_carried(
 
     The rows `held` (n, k, nv) hold.
     """
-    nv, slides, tree = step.place.shape[1], slide.any(-1), step.motion.tree
+    nv, slides = step.place.shape[1], slide.any(-1)
     tangents = np.moveaxis(contacts.tangent, 2, 0) * (closing & ~slides & (contacts.friction > 0))[:, :, None]
     # What touches without a load may have one with another action.
     normals = contacts.normal * (closing | (contacts.gap < 0))[:, :, None]
     forces = normals - _compute_drag(step, contacts, slide) * closing[:, :, None] if slides.any() else normals
-    rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), tree) for v in (normals, forces))
+    rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), step.motion) for v in (normals, forces))
     some = rows.any((0, 2))
     rows, forces = rows[:, some], forces[:, some]
     delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)
     pushed = _push(step.response, rows, forces, rows @ delayed)
-    return np.concatenate(np.split(pushed, 2, -1), 1)
+    half = pushed.shape[2] // 2
+    return np.concatenate([pushed[:, :, :half], pushed[:, :, half:]], 1)
 
 
 def _compute_drag(step: DynamicStep, contacts: MujocoContacts, slide: Array) -> Array:
@@ -389,9 +391,9 @@ def _compute_drag(step: DynamicStep, contacts: MujocoContacts, slide: Array) -> 
     return drag * np.minimum(1.0, 0.7 * yields / np.maximum(presses, 1e-300))[:, :, None]
 
 
-def _split_by_body(rows: Array, tree: NDArray[np.intp]) -> Array:
-    """Split rows (n, k, nv) of pairs of bodies into rows (n, 2 k, nv) of one body each, by `tree` (nv,)."""
-    trees = np.unique(tree)
+def _split_by_body(rows: Array, motion: Dynamic) -> Array:
+    """Split rows (n, k, nv) of pairs of bodies into rows (n, 2 k, nv) of one body each, by the trees of the motion."""
+    tree, trees = motion.tree, motion.trees
     if len(trees) == 1:
         return rows
     touched = np.stack([rows[:, :, tree == t].any(-1) for t in trees], -1)
