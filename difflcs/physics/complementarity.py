@@ -309,7 +309,7 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor, caps: Tensor, each: int)
     most, last = _join(-1, upper - lower, caps), torch.arange(n_lam - n, n_lam)
     forces = torch.cat([last, torch.arange(n_caps * each)])
     groups = n_lam + torch.cat([torch.arange(n), n + torch.arange(n_caps).repeat_interleave(each)])
-    added, first = n_lam + torch.arange(n + n_caps), torch.cat([last, torch.arange(0, n_caps * each, each)])
+    added, first = n_lam + torch.arange(n + n_caps), torch.cat([last, each * torch.arange(n_caps)])
     larger = F.new_zeros(*F.shape[:-2], n_lam + n + n_caps, n_lam + n + n_caps)
     larger[..., :n_lam, :n_lam] = F
     larger[..., forces, groups], larger[..., groups, forces] = 1.0, -1.0
