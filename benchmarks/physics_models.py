@@ -34,7 +34,6 @@ from difflcs.physics.mujoco import MujocoLCS
 from difflcs.physics.mujoco.lcs import Motion
 
 SECONDS = 0.02  # of a step
-ROUNDS = 10  # in which each motion takes its turn; the first does not count
 NEAR = 0.9  # of the way from the usual nominal control to the action
 MODELS = {  # package → its scenes; what does not load alone, or has no joint, is a part of others
     "dm_control": ["suite/*.xml"],
@@ -75,7 +74,7 @@ class Options:
     seed: int = 0
     """Seed of motions and controls."""
     times: bool = False
-    """Times alone."""
+    """Times alone, with another place for the JSON."""
     out: Path = Path("benchmarks/results/physics_models.json")
     """Where the JSON goes."""
 
@@ -235,7 +234,7 @@ def clock(model: Any, o: Options) -> dict[str, Any] | None:
             module = MujocoLCS(model, motion=motion, seconds=steps * model.opt.timestep)
             ways[motion] = partial(module.params, torch.stack([module.state.to_state(*state) for state in states]))
     times: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(ROUNDS):
+    for _ in range(10):  # the first does not count
         for name, way in ways.items():
             start = time.process_time()
             way()
@@ -246,7 +245,6 @@ def clock(model: Any, o: Options) -> dict[str, Any] | None:
 def main(o: Options) -> None:
     """Measure, print, write."""
     torch.set_num_threads(1)
-    o.out = o.out.with_stem(f"{o.out.stem}_times") if o.times else o.out
     results: dict[str, dict[str, Any]] = {}
     for package, paths in find(o.packages).items():
         for path in paths:

@@ -151,16 +151,10 @@ class _Record(SystemMatrices):
             vars(self)["_checked"] = now
 
     @classmethod
-    def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
-        """Make a record of tensors that have been checked, all of them and together; nothing is checked here."""
+    def of_checked(cls, tensors: Mapping[str, Tensor], like: Self | None = None) -> Self:
+        """Make a record of tensors that have been checked, all together, or with the F of `like`; it checks nothing."""
         record = object.__new__(cls)
-        vars(record).update(tensors, _checked=_numbers_of(tensors["F"]))
-        return record
-
-    def with_checked(self, **tensors: Tensor) -> Self:
-        """Return this record with other tensors in place of some, but not of F; nothing is checked here."""
-        record = object.__new__(type(self))
-        vars(record).update(vars(self) | tensors)
+        vars(record).update(vars(like) if like is not None else {"_checked": _numbers_of(tensors["F"])}, **tensors)
         return record
 
     @classmethod

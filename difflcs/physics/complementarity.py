@@ -263,11 +263,8 @@ def assemble_lcs(
     rows, normals = rows / length, normals / length
     F = rows @ C
     n_lam = F.shape[-1]
-    F = 0.5 * (F + F.swapaxes(-1, -2))
-    if of is torch:
-        F = F + torch.diag_embed(softness)
-    else:
-        F[..., np.arange(n_lam), np.arange(n_lam)] += softness
+    diagonal = torch.diag_embed(softness) if of is torch else softness[..., None] * np.eye(n_lam)
+    F = 0.5 * (F + F.swapaxes(-1, -2)) + diagonal
     D = rows @ free.A - (rows - normals)
     c = gap / length + _apply(rows, free.d) - _apply(normals, x)
     forces = np.arange(n_lam)
@@ -314,14 +311,8 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor, caps: Tensor, each: int)
     larger[..., :n_lam, :n_lam] = F
     larger[..., forces, groups], larger[..., groups, forces] = 1.0, -1.0
     larger[..., added, added] = _DRAG / F.diagonal(dim1=-2, dim2=-1)[..., first]
-    C, D, E = (
-        torch.cat([v, v.new_zeros(shape)], dim)
-        for v, shape, dim in (
-            (C, (*C.shape[:-1], n + n_caps), -1),
-            (D, (*D.shape[:-2], n + n_caps, D.shape[-1]), -2),
-            (E, (*E.shape[:-2], n + n_caps, E.shape[-1]), -2),
-        )
-    )
+    columns, rows = (0, n + n_caps), (0, 0, 0, n + n_caps)
+    C, D, E = (torch.nn.functional.pad(v, by) for v, by in ((C, columns), (D, rows), (E, rows)))
     return _Rows(C, d, D, E, larger, _join(-1, c, most))
 
 

@@ -91,4 +91,4 @@ class Caps:
         loads[:, : self.count] += lam[:, rays : rays + self.count]
         c = system.c.clone()
         c[..., -self.count :] = torch.from_numpy(read.batched(self.limit(read.dof_contacts, loads, response, 1.0)))
-        return system.with_checked(c=c)
+        return LCSParams.of_checked({"c": c}, like=system)

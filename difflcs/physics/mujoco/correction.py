@@ -157,7 +157,7 @@ def correct(
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
     C = np.concatenate([C, of_servos], -1)
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
-    return system.with_checked(C=C, d=d), doubtful
+    return LCSParams.of_checked({"C": C, "d": d}, like=system), doubtful
 
 
 def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:

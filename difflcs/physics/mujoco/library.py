@@ -15,34 +15,13 @@ from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMiss
 from difflcs.physics.mujoco.native import copy_taken, native
 
 _FUNCTIONS = (
-    "mj_kinematics",
-    "mj_comPos",
-    "mj_fwdPosition",
-    "mj_geomDistance",
-    "mj_solveM",
-    "mj_forwardSkip",
-    "mj_RungeKutta",
-    "mj_differentiatePos",
-    "mjd_transitionFD",
-    "mj_Euler",
-    "mj_implicit",
-)
+    "mj_kinematics mj_comPos mj_fwdPosition mj_geomDistance mj_solveM mj_forwardSkip mj_RungeKutta "
+    "mj_differentiatePos mjd_transitionFD mj_Euler mj_implicit"
+).split()
 _FIELDS = (
-    "qpos",
-    "qvel",
-    "act",
-    "ctrl",
-    "qacc_warmstart",
-    "geom_xpos",
-    "geom_xmat",
-    "cdof",
-    "subtree_com",
-    "actuator_length",
-    "qacc",
-    "act_dot",
-    "qfrc_smooth",
-    "ten_length",
-)
+    "qpos qvel act ctrl qacc_warmstart geom_xpos geom_xmat cdof subtree_com actuator_length qacc act_dot qfrc_smooth "
+    "ten_length"
+).split()
 _VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error", "mjcb_time")
 _KINDS, _MOST, _FIRST = int(mujoco.mjtGeom.mjNGEOMTYPES), 128, 10  # doubles of a contact, and those that are read
 _FLAT = """
@@ -102,10 +81,13 @@ class Place:
 
     def __init__(self, model: Any, data: Any):
         self.model, self.data = model, data
-        found = {name: _address(name, getattr(data, name)) for name in _FIELDS}
-        warnings, nv = data.warning.number, int(model.nv)
-        moment = (data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-        found |= {"moment": _describe_sparse(int(model.nu), nv, *moment), "tendon": _describe_tendons(model, data)}
+        found: dict[str, Any] = {name: _address(name, getattr(data, name)) for name in _FIELDS}
+        warnings, nv, n = data.warning.number, model.nv, model.ntendon
+        moment = data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        names = ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind") * (data.ten_J.size != n * nv)  # in newer versions
+        where = (getattr(data if hasattr(data, name) else model, name) for name in names)
+        found["moment"] = _describe_sparse(model.nu, nv, *moment)
+        found["tendon"] = _describe_sparse(n, nv, data.ten_J, *where)
         found |= {"model": model._address, "data": data._address, "ccd_tolerance": _option(model)}
         found |= {"warnings": warnings.ctypes.data, "kinds": len(warnings), "stride": warnings.strides[0] // 4}
         self.native = _mujoco.Place(found)
@@ -160,13 +142,6 @@ def _describe_sparse(rows: int, size: int, values: np.ndarray, *where: np.ndarra
     places = [_address("rows that are sparse", field, np.int32) for field in where] or [0, 0, 0]
     found = {"rows": rows, "size": size, "values": _address("a matrix", values)}
     return found | dict(zip(("counts", "starts", "columns"), places, strict=True))
-
-
-def _describe_tendons(model: Any, data: Any) -> dict[str, int]:
-    """Describe the derivatives (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
-    names, rows, size = ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind"), int(model.ntendon), int(model.nv)
-    where = [getattr(data if hasattr(data, name) else model, name) for name in names]
-    return _describe_sparse(rows, size, data.ten_J, *where * (data.ten_J.size != rows * size))
 
 
 def _option(model: Any) -> int:

@@ -125,10 +125,7 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
 
 
 def eigh(matrix: Array) -> tuple[Array, Array]:
-    """Compute eigenvalues (n, k) and eigenvectors (n, k, k) of symmetric matrices.
-
-    By torch: from k = 30 on NumPy's takes longer, and several times as long where OpenBLAS has threads.
-    """
+    """Compute eigenvalues (n, k) and vectors (n, k, k), by torch: threads of NumPy's OpenBLAS wait for each other."""
     size, directions = torch.linalg.eigh(torch.from_numpy(matrix))
     return size.numpy(), directions.numpy()
 

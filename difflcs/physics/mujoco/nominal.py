@@ -376,8 +376,7 @@ def _compute_carried(
     rows, forces = rows[:, some], forces[:, some]
     delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)
     pushed = _push(step.response, rows, forces, rows @ delayed)
-    half = pushed.shape[2] // 2
-    return np.concatenate([pushed[:, :, :half], pushed[:, :, half:]], 1)
+    return np.concatenate(np.split(pushed, 2, -1), 1)
 
 
 def _compute_drag(step: DynamicStep, contacts: MujocoContacts, slide: Array) -> Array:

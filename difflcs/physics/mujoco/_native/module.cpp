@@ -110,21 +110,14 @@ Place make_place(const nb::dict& f) {
   Place p{};
   p.model = at<const void*>(f, "model");
   p.data = at<void*>(f, "data");
-  p.qpos = at<double*>(f, "qpos");
-  p.qvel = at<double*>(f, "qvel");
-  p.act = at<double*>(f, "act");
-  p.ctrl = at<double*>(f, "ctrl");
-  p.qacc_warmstart = at<double*>(f, "qacc_warmstart");
-  p.geom_xpos = at<double*>(f, "geom_xpos");
-  p.ccd_tolerance = at<double*>(f, "ccd_tolerance");
-  p.geom_xmat = at<const double*>(f, "geom_xmat");
-  p.cdof = at<const double*>(f, "cdof");
-  p.subtree_com = at<const double*>(f, "subtree_com");
-  p.actuator_length = at<const double*>(f, "actuator_length");
-  p.qacc = at<const double*>(f, "qacc");
-  p.act_dot = at<const double*>(f, "act_dot");
-  p.qfrc_smooth = at<const double*>(f, "qfrc_smooth");
-  p.ten_length = at<const double*>(f, "ten_length");
+  for (auto [name, into] : {std::pair{"qpos", &p.qpos}, {"qvel", &p.qvel}, {"act", &p.act}, {"ctrl", &p.ctrl},
+                            {"qacc_warmstart", &p.qacc_warmstart}, {"geom_xpos", &p.geom_xpos},
+                            {"ccd_tolerance", &p.ccd_tolerance}})
+    *into = at<double*>(f, name);
+  for (auto [name, into] : {std::pair{"geom_xmat", &p.geom_xmat}, {"cdof", &p.cdof}, {"subtree_com", &p.subtree_com},
+                            {"actuator_length", &p.actuator_length}, {"qacc", &p.qacc}, {"act_dot", &p.act_dot},
+                            {"qfrc_smooth", &p.qfrc_smooth}, {"ten_length", &p.ten_length}})
+    *into = at<const double*>(f, name);
   p.moment = make_sparse(value<nb::dict>(f, "moment"));
   p.tendon = make_sparse(value<nb::dict>(f, "tendon"));
   p.warnings = at<int32_t*>(f, "warnings");
@@ -233,22 +226,27 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
   });
 }
 
-// Reads the inverse mass (n, nv, nv) at states and, unless `force` is empty, what is `AtRest` at nominal controls.
+// Reads the inverse mass (n, nv, nv) at states and, unless `force` is empty, what acts at rest at nominal controls.
 Outcome read_rest(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
                   Array<const double> state, Array<const double> ctrl, Array<double> inverse_mass, Array<double> force,
                   Array<double> nominal, Array<double> length, Array<double> moment, Array<double> tendon) {
-  const size_t n = state.shape(0), nv = motion.nv, nu = motion.nu;
+  const size_t n = state.shape(0), nv = motion.nv, nu = motion.nu, rest = force.size() > 0 ? n : 0;
   check(state.size() == n * (motion.nq + nv + motion.na) && ctrl.size() == n * nu && !places.empty() &&
-        inverse_mass.size() == n * nv * nv);
-  const size_t tendons = places[0]->tendon.rows, rest = force.size() > 0 ? n : 0;
-  check(force.size() == rest * nv && nominal.size() == rest * nu && length.size() == rest * nu &&
-        moment.size() == rest * nu * nv && tendon.size() == rest * tendons * nv);
+        inverse_mass.size() == n * nv * nv && force.size() == rest * nv && nominal.size() == rest * nu &&
+        length.size() == rest * nu && moment.size() == rest * nu * nv);
+  const size_t each = places[0]->tendon.rows * nv;
+  check(tendon.size() == rest * each);
   return at_places(library, places, n, [&](size_t p, int64_t i) {
-    const Reader reader(library, motion, *places[p]);
-    const double* from = state.data() + i * state.shape(1);
-    const AtRest into{inverse_mass.data() + i * nv * nv, force.data() + i * nv,       nominal.data() + i * nu,
-                      length.data() + i * nu,            moment.data() + i * nu * nv, tendon.data() + i * tendons * nv};
-    rest > 0 ? reader.read_rest(from, ctrl.data() + i * nu, into) : reader.read_mass(from, into.inverse_mass);
+    const Place& place = *places[p];
+    const Reader reader(library, motion, place);
+    reader.read_mass(state.data() + i * state.shape(1), inverse_mass.data() + i * nv * nv);
+    if (rest == 0) return;
+    reader.settle(ctrl.data() + i * nu);
+    std::copy_n(place.qfrc_smooth, nv, force.data() + i * nv);
+    std::copy_n(place.ctrl, nu, nominal.data() + i * nu);
+    std::copy_n(place.actuator_length, nu, length.data() + i * nu);
+    place.moment.write(moment.data() + i * nu * nv);
+    place.tendon.write(tendon.data() + i * each);
   });
 }
 

@@ -34,11 +34,6 @@ struct Linearised {
   double *middle, *acceleration, *A, *B, *inverse_mass, *nominal, *reached;
 };
 
-// One row of each array of `Rest` in quasi_dynamic.py that is read.
-struct AtRest {
-  double *inverse_mass, *force, *ctrl, *length, *moment, *tendon;
-};
-
 // Reads the motion at a state of qpos, qvel and act, with nominal controls, NaN where actuators have no force.
 class Reader {
  public:
@@ -72,18 +67,11 @@ class Reader {
     library_.solve_mass(motion_.simulated, place_.data, inverse_mass, motion_.identity.data(), motion_.nv);
   }
 
-  // Read the forces at rest, in which activation has settled.
-  void read_rest(const double* state, const double* ctrl, const AtRest& into) const {
-    const Motion& m = motion_;
-    read_mass(state, into.inverse_mass);
+  // Compute the forces at rest of that state, in which activation has settled.
+  void settle(const double* ctrl) const {
     hold(ctrl);
-    for (int j = 0; j < m.na; j++) place_.act[j] = place_.ctrl[m.activated[j]];
-    library_.forward(m.simulated, place_.data, kPositions, 1);
-    std::copy_n(place_.qfrc_smooth, m.nv, into.force);
-    std::copy_n(place_.ctrl, m.nu, into.ctrl);
-    std::copy_n(place_.actuator_length, m.nu, into.length);
-    place_.moment.write(into.moment);
-    place_.tendon.write(into.tendon);
+    for (int j = 0; j < motion_.na; j++) place_.act[j] = place_.ctrl[motion_.activated[j]];
+    library_.forward(motion_.simulated, place_.data, kPositions, 1);
   }
 
   // Write ζ, ν and the change of activation after the steps from a state at a control.
