@@ -73,8 +73,9 @@ constexpr int64_t kVaried = 8, kRounds = 4;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
 // The other rounds draw. Half of their plans have a little noise, and begin at contact softer by ten to the power of
-// kMelted to kMeltedMore; the others are stretched in time, at most by kStretched, or push an action for a while.
-constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kStretched = 1.5;
+// kMelted to kMeltedMore; in the others a part of the plan, kPart to kPartMore of it, comes at most kMostLater stages
+// earlier or later, mostly one, or an action is pushed for a while.
+constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kPart = 0.1, kPartMore = 0.8, kMostLater = 3.0;
 constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
 constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
 // It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
@@ -554,21 +555,24 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
   const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
   const bool shifted = kind / kVaried % kRounds == 0 && !again;
   const bool melted = !shifted && kind % 2 == 1;
-  const bool stretched = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
+  const bool moved = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
   const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
-  const int64_t begin = shift.part == Shift::end ? horizon / 2 : 0;
-  const int64_t end = shift.part == Shift::begin ? horizon / 2 : horizon;
-  const double h = double(horizon), fixed = random(drawn) < 0.5 ? 0.0 : h - 1.0;
-  const double stretch = std::pow(kStretched, 2.0 * random(drawn + 1) - 1.0);
-  const double middle = h * random(drawn), way = random(drawn + 2) < 0.5 ? 1.0 : -1.0;
+  int64_t begin = shift.part == Shift::end ? horizon / 2 : 0, later = shift.later;
+  int64_t end = shift.part == Shift::begin ? horizon / 2 : horizon;
+  const double h = double(horizon), middle = h * random(drawn), way = random(drawn + 2) < 0.5 ? 1.0 : -1.0;
+  if (moved) {
+    const double part = h * (kPart + (kPartMore - kPart) * random(drawn + 5)), far = random(drawn + 7);
+    begin = int64_t((h - 0.5 * part) * random(drawn + 6));
+    end = std::min(horizon, int64_t(std::ceil(double(begin) + part)));
+    later = int64_t(way) * (1 + int64_t(kMostLater * far * far));
+  }
   const double push = way * (kLeastPush + (1.0 - kLeastPush) * random(drawn + 3));
   const double length = std::max(1.0, h * kShortest * std::pow(kLongest / kShortest, random(drawn + 1)));
   const int64_t which = int64_t(double(n_u) * random(drawn + 4));
   for (int64_t i = 0; i < horizon * n_u; i++) {
     const Bound bound(batch, tried.element[job], i);
     const int64_t k = i / n_u, j = i % n_u;
-    int64_t from = begin <= k && k < end ? std::min(std::max(k + shift.later, begin), end - 1) : k;
-    if (stretched) from = std::min(std::max(std::lround(fixed + (double(k) - fixed) * stretch), 0l), horizon - 1);
+    const int64_t from = begin <= k && k < end ? std::min(std::max(k + later, begin), end - 1) : k;
     double action = plan[from * n_u + j];
     const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(action);
     if (pushed && j == which && std::abs(double(k) - middle) <= 0.5 * length) action += push * range;

@@ -52,9 +52,9 @@ class BatchedBackend(Backend):
     which find contacts that are far; random pulses, a push and a brake of each action, or swings to and fro. Starts are
     compared after a few steps at the relaxation, or at 1e-5 if that is softer, and only those that may still win are
     solved to the end; at a harder relaxation the plan that is found is solved once more. Half of the starts, eight for
-    each action, are enough where these agree. A local search follows, unless they agree: the best plan is shifted or
-    stretched in time, pushed, or solved again from softer contact, until that finds nothing better, longer for long
-    plans. Of four to seven starts only four of these are tried.
+    each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
+    part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
+    for long plans. Of four to seven starts only four of these are tried.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
