@@ -52,9 +52,8 @@ constexpr int64_t kSoftPulses = 8;
 constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
 // finds is then solved at the problem's own, whose kinks keep a plan where it begins.
-constexpr double kSoft = 1e-5, kSofter = 1000.0;
-// Of a limited time the search has this part, once the first starts are compared; the rest is for that.
-constexpr double kSearched = 0.6;
+// Of a limited time the search has the part kSearched, once the first starts are compared; the rest is for that.
+constexpr double kSoft = 1e-5, kSofter = 1000.0, kSearched = 0.6;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
@@ -73,11 +72,10 @@ constexpr int64_t kVaried = 8, kRounds = 4;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
 // The other rounds draw. Half of their plans have a little noise, and begin at contact softer by ten to the power of
-// kMelted to kMeltedMore; in the others a part of the plan, kPart to kPartMore of it, comes at most kMostLater stages
-// earlier or later, mostly one, or an action is pushed for a while.
+// kMelted to kMeltedMore; in the others kPart to kPartMore of it come up to kMostLater stages earlier or later, or an
+// action is pushed for a while.
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kPart = 0.1, kPartMore = 0.8, kMostLater = 3.0;
-constexpr double kShortest = 0.05, kLongest = 0.6;  // a push, in parts of the horizon
-constexpr double kLeastPush = 0.25;                  // in parts of the range of the action
+constexpr double kShortest = 0.05, kLongest = 0.6, kLeastPush = 0.25;  // a push, in parts of horizon and range
 // It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
 // kGain. Once one has, there is more to find: it ends after as many rounds in vain as there are starts. Plans of kLong
 // stages get as many again, shorter ones fewer, and half as many at least where one start alone found the plan. Eight
@@ -301,9 +299,7 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
       solve_once(searched, guess, effort, out, runner, first, count, hard ? kExplore : 0);
     else
       search(searched, batch.relaxation, guess, effort, out, runner, first, count);
-    if (!hard) continue;
-    runner.allot(1.0);
-    harden(batch, effort, out, runner, first, count);
+    if (hard) harden(batch, effort, out, runner, first, count);
   }
   for (const bool pivot : {false, true})
     if (!runner.stopped()) retry_failed(batch, effort, out, runner, pivot);
@@ -525,6 +521,7 @@ bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, d
 void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                        int64_t first, int64_t count) {
   const MpcPlans to = shifted(batch, out, first);
+  runner.allot(1.0);
   tried.resize(batch, count);
   for (int64_t e = 0; e < count; e++) {
     copy_plan(Sizes(batch), to, e, tried.plans(), e);
@@ -554,17 +551,16 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
   const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
   const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
   const bool shifted = kind / kVaried % kRounds == 0 && !again;
-  const bool melted = !shifted && kind % 2 == 1;
-  const bool moved = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
+  const bool melted = !shifted && kind % 2 == 1, moved = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
   const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
   int64_t begin = shift.part == Shift::end ? horizon / 2 : 0, later = shift.later;
   int64_t end = shift.part == Shift::begin ? horizon / 2 : horizon;
   const double h = double(horizon), middle = h * random(drawn), way = random(drawn + 2) < 0.5 ? 1.0 : -1.0;
   if (moved) {
-    const double part = h * (kPart + (kPartMore - kPart) * random(drawn + 5)), far = random(drawn + 7);
+    const double part = h * (kPart + (kPartMore - kPart) * random(drawn + 5));
     begin = int64_t((h - 0.5 * part) * random(drawn + 6));
     end = std::min(horizon, int64_t(std::ceil(double(begin) + part)));
-    later = int64_t(way) * (1 + int64_t(kMostLater * far * far));
+    later = int64_t(way) * (1 + int64_t(kMostLater * std::pow(random(drawn + 7), 2)));
   }
   const double push = way * (kLeastPush + (1.0 - kLeastPush) * random(drawn + 3));
   const double length = std::max(1.0, h * kShortest * std::pow(kLongest / kShortest, random(drawn + 1)));
