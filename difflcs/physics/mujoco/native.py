@@ -8,7 +8,6 @@ from typing import Any, TypeVar, cast
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -124,12 +123,6 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
     raise InvalidInputError(f"{text.format(**size)} ({where})") from said
 
 
-def eigh(matrix: Array) -> tuple[Array, Array]:
-    """Compute eigenvalues (n, k) and vectors (n, k, k), by torch: threads of NumPy's OpenBLAS wait for each other."""
-    size, directions = torch.linalg.eigh(torch.from_numpy(matrix))
-    return size.numpy(), directions.numpy()
-
-
 def factor_inverse(inverse_mass: Array) -> Array:
     """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
 
@@ -152,6 +145,6 @@ def implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
     10¹⁰ times as heavy.
     """
     scaled = -h * np.linalg.solve(factor, (D + h * K) @ factor)
-    size, directions = eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
+    size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
     directions = factor @ directions
     return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)

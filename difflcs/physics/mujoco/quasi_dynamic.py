@@ -31,7 +31,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
 from difflcs.physics.mujoco.library import Places, library
-from difflcs.physics.mujoco.native import eigh, flags
+from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
@@ -137,7 +137,7 @@ def respond(mass: NDArray[Any], damping: Array, stiffness: Array, seconds: float
     """Compute R (..., nv, nv), how far a unit of force moves in a step, of symmetric matrices (..., nv, nv)."""
     inverse = np.linalg.inv(np.linalg.cholesky(damping + mass / seconds))  # L⁻¹ with C = L Lᵀ
     transposed = inverse.swapaxes(-1, -2)
-    rate, modes = eigh(inverse @ stiffness @ transposed)
+    rate, modes = np.linalg.eigh(inverse @ stiffness @ transposed)
     z = np.maximum(seconds * rate, -_UNSTABLE)
     part = np.where(np.abs(z) < 1e-9, 1.0, -np.expm1(-z) / np.where(z == 0, 1.0, z))
     modes = transposed @ modes

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from difflcs.errors import ContactWarning, warn
 from difflcs.physics.mujoco.actuators import Actuators
-from difflcs.physics.mujoco.native import eigh
 from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
@@ -131,7 +130,7 @@ class Servos:
         rests = force - ((after @ reached[:, :, None] + before @ x[:, :, None] + by @ nominal[:, :, None])[:, :, 0])
         A, B, C, d, D, E, F, c = (v.reshape(n, *v.shape[len(batch) :]).numpy() for v in system.tensors().values())
         inner = np.eye(k) + after @ effect
-        parts, directions = eigh(0.5 * (inner + inner.swapaxes(-1, -2)))
+        parts, directions = np.linalg.eigh(0.5 * (inner + inner.swapaxes(-1, -2)))
         inner = directions * np.maximum(parts, _LEAST)[:, None] @ directions.swapaxes(-1, -2)
         inner = np.kron([[1, -1], [-1, 1]], np.ones((k, k))) * np.tile(inner, (2, 2)) + _GIVES_BACK * np.eye(2 * k)
         state, action, carried = after @ A + before, after @ B + by, after @ C
