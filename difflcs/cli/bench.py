@@ -2,7 +2,7 @@
 
 import json
 import platform
-import time
+import timeit
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,12 +105,7 @@ def _short(seconds: float) -> str:
 def best(repeats: int, work: Callable[[], object]) -> float:
     """Measure the shortest time [s] of several runs, after one that does not count."""
     work()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return min(timeit.repeat(work, repeat=repeats, number=1))
 
 
 def smoke_path(path: Path) -> Path:

@@ -167,60 +167,25 @@ _SUGAR, _CAN, _BANANA = (0.1760, 0.0922, 0.0451), (0.0853, 0.0847, 0.0333), (0.1
 _MUG, _WRENCH = (0.1050, 0.0925, 0.0811), (0.2028, 0.0583, 0.0133)
 _MEDIUM, _LARGE, _EXTRA_LARGE = (0.0847, 0.0770, 0.0259), (0.1648, 0.1215, 0.0357), (0.2022, 0.1652, 0.0354)
 
-YCB: Mapping[str, YcbObject] = MappingProxyType(
-    {
-        entry.name: entry
-        for entry in (
-            YcbObject(
-                "sugar_box",
-                "004_sugar_box",
-                0.514,
-                _SUGAR,
-                0.02166,
-                1,
-                (_box((-0.088, 0.088), (-0.0461, 0.0461), _SUGAR[2]),),
-            ),
-            YcbObject(
-                "fish_can",
-                "007_tuna_fish_can",
-                0.171,
-                _CAN,
-                0.01606,
-                1,
-                (Primitive("cylinder", (0.0, 0.0, _CAN[2] / 2), (0.0425, _CAN[2] / 2)),),
-            ),
-            YcbObject("banana", "011_banana", 0.066, _BANANA, 0.01727, 4, _arc(_BANANA, 6), 0.05),
-            YcbObject(
-                "mug",
-                "025_mug",
-                0.118,
-                _MUG,
-                0.02710,
-                6,
-                (
-                    Primitive("cylinder", (-0.00625, 0.0, _MUG[2] / 2), (0.04625, _MUG[2] / 2)),
-                    Primitive("box", (0.0445, 0.0, _MUG[2] / 2), (0.008, 0.006, 0.027)),  # the handle
-                ),
-            ),
-            YcbObject(
-                "wrench",
-                "042_adjustable_wrench",
-                0.252,
-                _WRENCH,
-                0.00586,
-                9,
-                (
-                    _box((-0.0550, 0.1014), (-0.0130, 0.0130), 0.010),
-                    _box((-0.1014, -0.0500), (-0.02915, 0.02915), _WRENCH[2]),
-                ),
-                0.05,
-            ),
-            YcbObject("clamp", "050_medium_clamp", 0.059, _MEDIUM, 0.01252, 8, _clamp(_MEDIUM)),
-            YcbObject("large_clamp", "051_large_clamp", 0.125, _LARGE, 0.01714, 8, _clamp(_LARGE)),
-            YcbObject(
-                "extra_large_clamp", "052_extra_large_clamp", 0.202, _EXTRA_LARGE, 0.01837, 8, _clamp(_EXTRA_LARGE)
-            ),
-        )
-    }
+_SUGAR_PARTS = (_box((-0.088, 0.088), (-0.0461, 0.0461), _SUGAR[2]),)
+_CAN_PARTS = (Primitive("cylinder", (0.0, 0.0, _CAN[2] / 2), (0.0425, _CAN[2] / 2)),)
+_MUG_PARTS = (
+    Primitive("cylinder", (-0.00625, 0.0, _MUG[2] / 2), (0.04625, _MUG[2] / 2)),
+    Primitive("box", (0.0445, 0.0, _MUG[2] / 2), (0.008, 0.006, 0.027)),  # the handle
 )
+_WRENCH_PARTS = (
+    _box((-0.0550, 0.1014), (-0.0130, 0.0130), 0.010),
+    _box((-0.1014, -0.0500), (-0.02915, 0.02915), _WRENCH[2]),
+)
+_OBJECTS = (
+    YcbObject("sugar_box", "004_sugar_box", 0.514, _SUGAR, 0.02166, 1, _SUGAR_PARTS),
+    YcbObject("fish_can", "007_tuna_fish_can", 0.171, _CAN, 0.01606, 1, _CAN_PARTS),
+    YcbObject("banana", "011_banana", 0.066, _BANANA, 0.01727, 4, _arc(_BANANA, 6), 0.05),
+    YcbObject("mug", "025_mug", 0.118, _MUG, 0.02710, 6, _MUG_PARTS),
+    YcbObject("wrench", "042_adjustable_wrench", 0.252, _WRENCH, 0.00586, 9, _WRENCH_PARTS, 0.05),
+    YcbObject("clamp", "050_medium_clamp", 0.059, _MEDIUM, 0.01252, 8, _clamp(_MEDIUM)),
+    YcbObject("large_clamp", "051_large_clamp", 0.125, _LARGE, 0.01714, 8, _clamp(_LARGE)),
+    YcbObject("extra_large_clamp", "052_extra_large_clamp", 0.202, _EXTRA_LARGE, 0.01837, 8, _clamp(_EXTRA_LARGE)),
+)
+YCB: Mapping[str, YcbObject] = MappingProxyType({entry.name: entry for entry in _OBJECTS})
 """Our name → object. The paper does not say which clamp it uses: `clamp` is the medium one."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import tempfile
@@ -342,33 +341,22 @@ def _decompose(vertices: np.ndarray, faces: np.ndarray, count: int, concavity: f
 
 
 def _read_parts(path: Path) -> tuple[np.ndarray, ...] | None:
-    """Read cached parts; None if there are none or the file is damaged."""
+    """Read cached parts; None if there are none or the file is damaged, which the checksums of the archive tell."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            points, ends = stored["points"], stored["ends"]
-            if stored["sha256"].tobytes() != hashlib.sha256(points.tobytes() + ends.tobytes()).digest():
-                return None
-            return tuple(np.split(points, ends[:-1]))
+            return tuple(np.split(stored["points"], stored["ends"][:-1]))
     except Exception:  # a damaged archive fails in many ways; the parts are computed again
         return None
 
 
 def _write_parts(path: Path, parts: tuple[np.ndarray, ...]) -> None:
     """Write in one step: other processes see the old file or the new one. A cache that is not writable is ignored."""
-    points, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])
-    digest = np.frombuffer(hashlib.sha256(points.tobytes() + ends.tobytes()).digest(), np.uint8)
-    buffer = io.BytesIO()
-    np.savez(buffer, points=points, ends=ends, sha256=digest)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(buffer.getvalue())
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as work:
+            new = Path(work, path.name)
+            np.savez(new, points=np.concatenate(parts), ends=np.cumsum([len(part) for part in parts]))
+            os.replace(new, path)
 
 
 # --- all steps together --------------------------------------------------------------------------------
