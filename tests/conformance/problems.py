@@ -9,17 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from difflcs import (
-    ConstraintSequence,
-    CostSequence,
-    LCSMPCLayer,
-    LCSParams,
-    LCSSequence,
-    LinearConstraints,
-    QuadraticCost,
-    StageBounds,
-    solve_lcp,
-)
+import difflcs
 from difflcs.cli.bench import pushing_model
 from difflcs.systems import pushing_cost
 from tests.conformance import judges
@@ -99,19 +89,19 @@ class Asked(torch.nn.Module):
 
 def layer_of(t, staged, horizon, asked=False, **options):
     """The layer that inputs by name describe, those of `staged` by stage; `asked`: its cost is a module."""
-    lcs = (LCSSequence if "A" in staged else LCSParams)(**{k: t[k] for k in LCS})
+    lcs = (difflcs.LCSSequence if "A" in staged else difflcs.LCSParams)(**{k: t[k] for k in LCS})
     weights, by_stage = {k: t[k] for k in COST if k in t}, tuple(staged & set(COST))
-    kind = CostSequence if by_stage else QuadraticCost
+    kind = difflcs.CostSequence if by_stage else difflcs.QuadraticCost
     cost = kind(**weights, check=False, **({"by_stage": by_stage} if by_stage else {}))
     limits, by_stage = {k: t[k] for k in BOUNDS if k in t}, tuple(staged & set(BOUNDS))
-    options |= {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
+    options |= {"bounds": difflcs.StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
     if "g" in t:
         rows = {name: t.get(key) for key, name in ROWS.items()}
         by_stage = tuple(ROWS[key] for key in staged & set(ROWS))
         options["constraints"] = (
-            ConstraintSequence(**rows, by_stage=by_stage) if by_stage else LinearConstraints(**rows)
+            difflcs.ConstraintSequence(**rows, by_stage=by_stage) if by_stage else difflcs.LinearConstraints(**rows)
         )
-    return LCSMPCLayer(lcs, Asked(cost) if asked else cost, horizon, **options)
+    return difflcs.LCSMPCLayer(lcs, Asked(cost) if asked else cost, horizon, **options)
 
 
 def solve(problem, backend, guess=None, tensors=None, **options):
@@ -129,7 +119,7 @@ def rollout(problem, t, u):
     for k in range(problem.horizon):
         now = {name: t[name][:, k if name in problem.staged else 0] for name in LCS}
         D, E, F, c = (now[name] for name in "DEFc")
-        lam = solve_lcp(F, mul(D, states[-1]) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
+        lam = difflcs.solve_lcp(F, mul(D, states[-1]) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
         states.append(affine(now, "ABCd", states[-1], u[:, k], lam))
     return torch.stack(states, 1)
 

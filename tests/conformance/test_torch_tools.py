@@ -13,21 +13,8 @@ from torch.nn import utils
 from torch.nn.utils import parametrizations, parametrize, prune
 from torch.optim.swa_utils import AveragedModel
 
-from difflcs import (
-    GoalCost,
-    LCSModel,
-    LCSMPCLayer,
-    LCSParams,
-    LinearConstraints,
-    StageBounds,
-    Transitions,
-    _storage,
-    fit_report,
-    prediction_loss,
-    solve_lcp,
-    suggest_scales,
-    violation_loss,
-)
+import difflcs
+from difflcs import _storage
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import Primal
 from difflcs.physics import Circle, ContactLCS, PlanarPushing
@@ -88,7 +75,7 @@ def stir(module, seed=9):
 
 def make(tool="none", dtype=torch.float64):
     """A model that the tool has changed, and whose parameters were changed after that, as by an optimiser."""
-    model = LCSModel(4, 2, 3, init_scale=0.4, generator=torch.Generator().manual_seed(0), dtype=dtype).eval()
+    model = difflcs.LCSModel(4, 2, 3, init_scale=0.4, generator=torch.Generator().manual_seed(0), dtype=dtype).eval()
     with warnings.catch_warnings(), torch.random.fork_rng():
         warnings.simplefilter("ignore", FutureWarning)  # of old tools
         torch.manual_seed(0)
@@ -109,16 +96,16 @@ def matrix(model, name):
 
 
 def right(model):
-    fields = {name: matrix(model, name) for name in LCSModel.parameter_names}
+    fields = {name: matrix(model, name) for name in difflcs.LCSModel.parameter_names}
     G, H = fields.pop("G"), fields.pop("H")
     F = G @ G.mT + model.stiffness * torch.eye(3, dtype=G.dtype) + H - H.mT
-    return LCSParams(**fields, F=F)
+    return difflcs.LCSParams(**fields, F=F)
 
 
 def layer(lcs, **options):
-    cost = GoalCost.reach(4, 2, goal_weight=(10.0, 10.0), input_weight=0.1, dtype=getattr(lcs, "B", X).dtype)
+    cost = difflcs.GoalCost.reach(4, 2, goal_weight=(10.0, 10.0), input_weight=0.1, dtype=getattr(lcs, "B", X).dtype)
     options = {"cost": cost, "horizon": HORIZON, "u_min": -1.0, "u_max": 1.0} | options
-    return LCSMPCLayer(lcs, **options)
+    return difflcs.LCSMPCLayer(lcs, **options)
 
 
 def plans(solution):
@@ -138,14 +125,14 @@ def observed(x=X, goal=GOAL):
 
 
 ENTRIES = {
-    "step": lambda lcs, x, u, *_: (lcs.step if isinstance(lcs, LCSParams) else lcs)(x, u),
+    "step": lambda lcs, x, u, *_: (lcs.step if isinstance(lcs, difflcs.LCSParams) else lcs)(x, u),
     "rollout": lambda lcs, x, u, *_: (lcs.rollout(x, u[:, None].expand(-1, 2, -1)),),
-    "params": lambda lcs, x, u, *_: (lcs if isinstance(lcs, LCSParams) else lcs.params()).step(x, u),
-    "violation": lambda lcs, x, u, y, _: (violation_loss(lcs, x, u, y),),
-    "violation of each": lambda lcs, x, u, y, _: (violation_loss(lcs, x, u, y, "auto", reduction="none"),),
-    "prediction": lambda lcs, x, u, y, _: (prediction_loss(lcs, x, u, y),),
+    "params": lambda lcs, x, u, *_: (lcs if isinstance(lcs, difflcs.LCSParams) else lcs.params()).step(x, u),
+    "violation": lambda lcs, x, u, y, _: (difflcs.violation_loss(lcs, x, u, y),),
+    "violation of each": lambda lcs, x, u, y, _: (difflcs.violation_loss(lcs, x, u, y, "auto", reduction="none"),),
+    "prediction": lambda lcs, x, u, y, _: (difflcs.prediction_loss(lcs, x, u, y),),
     "layer": lambda lcs, x, u, y, goal: plans(layer(lcs)(x, goal)),
-    "call of a layer": lambda lcs, x, u, y, goal: plans(layer(LCSModel(4, 2, 3))(x, goal, lcs=lcs)),
+    "call of a layer": lambda lcs, x, u, y, goal: plans(layer(difflcs.LCSModel(4, 2, 3))(x, goal, lcs=lcs)),
     "policy": lambda lcs, x, u, y, goal: (policy_of(lcs).solve(observed(x, goal))["loc"],),
 }
 
@@ -199,12 +186,12 @@ def test_jacobians_of_a_policy_are_those_of_its_actions(tool):
 
 @every_tool
 def test_controllers_and_files_hold_the_matrices_as_they_are(tool, tmp_path):
-    model, scales = make(tool), suggest_scales(X, U, NEXT)
+    model, scales = make(tool), difflcs.suggest_scales(X, U, NEXT)
     for _ in range(2):
         expected = right(model)
         with torch.no_grad():
             model.save_pretrained(tmp_path)
-        saved = LCSModel.from_pretrained(tmp_path)
+        saved = difflcs.LCSModel.from_pretrained(tmp_path)
         assert saved.c.requires_grad
         for name, value in saved.params().tensors().items():
             torch.testing.assert_close(value, getattr(expected, name))
@@ -230,9 +217,9 @@ FIELDS |= {"Q_final": FIELDS["Q"], "goal_to_q_final": FIELDS["goal_to_q"], "goal
 
 
 def problem(values, staged):
-    limits = {"u_min": None, "u_max": None, "bounds": StageBounds(-1.0, values["stages"])} if staged else {}
-    rows = LinearConstraints(values["G"], values["g"], weight=values["weight"])
-    cost = GoalCost(*(values[name] for name in COST))
+    limits = {"u_min": None, "u_max": None, "bounds": difflcs.StageBounds(-1.0, values["stages"])} if staged else {}
+    rows = difflcs.LinearConstraints(values["G"], values["g"], weight=values["weight"])
+    cost = difflcs.GoalCost(*(values[name] for name in COST))
     return layer(make(), **({"u_max": values["u_max"], "cost": cost, "constraints": rows} | limits))
 
 
@@ -271,7 +258,7 @@ def test_parts_of_a_module_that_are_never_called(tool):
         with torch.no_grad():
             raw.add_(torch.tensor([0.2, -0.1]))
             plain.friction.copy_(matrix(changed, "friction"))
-        values = [violation_loss(lcs, x, draw(4), x + 0.01, "auto") for lcs in discs]
+        values = [difflcs.violation_loss(lcs, x, draw(4), x + 0.01, "auto") for lcs in discs]
         torch.testing.assert_close(*values)
         found, expected = (torch.autograd.grad(v, p)[0] for v, p in zip(values, (raw, plain.friction), strict=True))
         torch.testing.assert_close(found, expected * (matrix(changed, "friction") / raw).detach())
@@ -281,7 +268,7 @@ def test_what_a_training_keeps_can_be_read(tmp_path):
     from difflcs.rl.learning import dynamics, mlp, trainer
 
     state = trainer.learned_state(make("prune"))
-    LCSModel.from_config(state["settings"], state["plain"], "checkpoint")
+    difflcs.LCSModel.from_config(state["settings"], state["plain"], "checkpoint")
     network = mlp.MLPController(lambda *_: X, 4, -torch.ones(2), torch.ones(2), 8, 10)
     parametrizations.weight_norm(network.layers[0])
     trainer.save_learned(network, tmp_path, "network")
@@ -295,7 +282,7 @@ def test_what_a_training_keeps_can_be_read(tmp_path):
 
 @pytest.mark.parametrize("name", ["C", "Q"])
 def test_hooks_that_nobody_knows_are_refused_where_they_compute_a_matrix(name):
-    model, cost = LCSModel(4, 2, 3), GoalCost.reach(4, 2)
+    model, cost = difflcs.LCSModel(4, 2, 3), difflcs.GoalCost.reach(4, 2)
     part, mpc = model if name == "C" else cost, layer(model, cost=cost)
     part.register_forward_pre_hook(lambda *_: None)  # of a profiler, say
     mpc(X, X)
@@ -303,27 +290,27 @@ def test_hooks_that_nobody_knows_are_refused_where_they_compute_a_matrix(name):
     delattr(part, name)
     setattr(part, name, value)
     uses = [lambda: mpc(X, X), mpc.controller]
-    for use in [*uses, lambda: violation_loss(model, X, U, NEXT), model.params] if part is model else uses:
+    for use in [*uses, lambda: difflcs.violation_loss(model, X, U, NEXT), model.params] if part is model else uses:
         refuse(InvalidInputError, rf"attributes in the place of \['{name}'\].*parametrize", use)
 
 
 def test_an_average_is_refused_where_its_module_is_meant():
-    refuse(DTypeError, "lcs: expected", layer, AveragedModel(LCSModel(4, 2, 3)))
+    refuse(DTypeError, "lcs: expected", layer, AveragedModel(difflcs.LCSModel(4, 2, 3)))
 
 
 def test_a_normalisation_that_moves_with_every_look_gives_one_matrix_a_call():
-    model = of_each(parametrizations.spectral_norm)(LCSModel(4, 2, 3, init_scale=0.4)).train()
+    model = of_each(parametrizations.spectral_norm)(difflcs.LCSModel(4, 2, 3, init_scale=0.4)).train()
     F = model.params().F.detach()
     assert float(torch.linalg.eigvalsh(F + F.mT).min()) >= 2 * model.stiffness - 1e-12
 
 
 MORE = {
-    "lcp": lambda lcs, x, *_: solve_lcp(lcs.params().F, x[:, :3])[:2],
+    "lcp": lambda lcs, x, *_: difflcs.solve_lcp(lcs.params().F, x[:, :3])[:2],
     "gap": lambda lcs, x, u, *_: (lcs.params().gap(x, u), lcs.params().next_state(x, u, x[:, :3])),
     "F": lambda lcs, *_: (lcs.F,),
     "reference": lambda lcs, x, *_: plans(layer(lcs)(x, reference=x[:, None, :2].expand(-1, HORIZON + 1, -1))),
     "cost": lambda lcs, x, u, y, goal: (layer(lcs).cost(lcs.B).q, layer(lcs).cost.stage(x, u, lcs.B)),
-    "scaled": lambda lcs, x, u, y, goal: plans(layer(ScaledLCS(lcs, suggest_scales(x, u, y)))(x, goal)),
+    "scaled": lambda lcs, x, u, y, goal: plans(layer(ScaledLCS(lcs, difflcs.suggest_scales(x, u, y)))(x, goal)),
 }
 
 
@@ -366,8 +353,8 @@ def test_on_a_gpu_physics_and_reports_are_those_of_the_cpu():
     found = []
     for to in (lambda v: v, lambda v: v.cuda()):
         lcs, *rows = map(to, (ContactLCS(physics, learned), x, u, x + 0.01))
-        report, (left, _) = fit_report(lcs, *rows), Transitions(*rows).split(0.5)
-        loss = violation_loss(lcs, *left, "auto")
+        report, (left, _) = difflcs.fit_report(lcs, *rows), difflcs.Transitions(*rows).split(0.5)
+        loss = difflcs.violation_loss(lcs, *left, "auto")
         found.append([loss, report.gain, *torch.autograd.grad(loss, list(lcs.parameters()))])
     assert all(v.is_cuda for v in found[1])
     torch.testing.assert_close([v.cpu() for v in found[1]], found[0])

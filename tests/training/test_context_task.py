@@ -6,27 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs import GoalCost
-from difflcs.rl import (
-    EnsembleSettings,
-    Epochs,
-    ModelRollouts,
-    ModelRolloutSettings,
-    PhysicsSpec,
-    TaskSpec,
-    TrainConfig,
-    collect,
-    evaluate,
-    get_method,
-    load_policy,
-    method_names,
-    train,
-)
+from difflcs import GoalCost, rl
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
 from tests.training import slide
 from tests.training.slide import STEPS, U_MAX, Gain, Gains
 
-TASK = TaskSpec(
+TASK = rl.TaskSpec(
     name="gains",
     env=Gains,
     make_cost=lambda: GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=0.1),
@@ -38,7 +23,7 @@ TASK = TaskSpec(
     n_context=1,
     features=lambda state, goal, elapsed, context: torch.cat([slide.features(state, goal, elapsed), context], -1),
     outcome=slide.outcome,
-    physics=PhysicsSpec(make_system=Gain, scale=(1.0,)),
+    physics=rl.PhysicsSpec(make_system=Gain, scale=(1.0,)),
 )
 
 
@@ -47,16 +32,16 @@ TASK = TaskSpec(
     "method",
     sorted(
         method.name
-        for method in map(get_method, {*method_names()} - {"violation", "ppo", "mujoco-lcs"})
+        for method in map(rl.get_method, {*rl.method_names()} - {"violation", "ppo", "mujoco-lcs"})
         if method.__module__.startswith("difflcs.")  # examples register methods of their own
     ),
 )
 def test_every_method_trains_a_task_with_a_context(method, tmp_path):
-    config = replace(TrainConfig(task="gains", method=get_method(method)()).smoke(), minutes=0.6)
-    run = train(config, tmp_path / "run", task=TASK)
-    policy = load_policy(run, TASK)
+    config = replace(rl.TrainConfig(task="gains", method=rl.get_method(method)()).smoke(), minutes=0.6)
+    run = rl.train(config, tmp_path / "run", task=TASK)
+    policy = rl.load_policy(run, TASK)
     envs = TASK.make_envs(4)
-    again = evaluate(envs, policy, 4, 0, STEPS)
+    again = rl.evaluate(envs, policy, 4, 0, STEPS)
     assert again.success_rate == pytest.approx(float(run.rows()[-1]["evaluation_success_rate"]))
 
 
@@ -64,9 +49,11 @@ def test_networks_see_the_context():
     """Model rollouts have the context of their start, and predict by it."""
     env = TASK.make_envs(40)
     rng = np.random.default_rng(0)
-    episodes, unseen = (collect(env, uniform_actions(env, rng), range(first, first + 40), STEPS) for first in (0, 100))
-    ensemble = EnsembleSettings(networks=1, width=32, epochs=Epochs(80, 3, 64))
-    models = ModelRollouts(env, slide.outcome, ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
+    episodes, unseen = (
+        rl.collect(env, uniform_actions(env, rng), range(first, first + 40), STEPS) for first in (0, 100)
+    )
+    ensemble = rl.EnsembleSettings(networks=1, width=32, epochs=rl.Epochs(80, 3, 64))
+    models = rl.ModelRollouts(env, slide.outcome, rl.ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
     models.add(episodes)
     models.fit()
     start, _ = models.env.reset(seed=3)

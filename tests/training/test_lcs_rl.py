@@ -5,32 +5,22 @@ import torch
 from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.learning.state_tree import copy_state
-from tests.training.slide import (
-    ROLLOUTS,
-    STEPS,
-    make_envs,
-    make_model,
-    make_models,
-    make_mpc,
-    make_ppo,
-    parameters,
-    same,
-)
+from tests.training import slide
 
 
 def make_lcsrl(seed: int = 0, models: bool = False, **changes) -> LCSRL:
-    lcs = make_model()
-    mpc = make_mpc(lcs)
+    lcs = slide.make_model()
+    mpc = slide.make_mpc(lcs)
     settings = WarmupSettings(rollouts=Rollouts(first=2, each=3), noise=0.02, epochs=Epochs(3, 2, 8))
-    warmup, envs = Warmup(lcs, mpc, make_envs(3), settings, seed, STEPS), make_envs()
+    warmup, envs = Warmup(lcs, mpc, slide.make_envs(3), settings, seed, slide.STEPS), slide.make_envs()
 
     def make_main(first_episode: int, first_iteration: int) -> PPO:
         options = {"first_episode": first_episode, "first_iteration": first_iteration}
-        options["total_episodes"] = 8 + 2 * ROLLOUTS
-        rollouts = make_models(seed, 2, iterations=1, rollouts=5) if models else None
-        return make_ppo(seed, env=envs, models=rollouts, controller=mpc, options=options, **changes)
+        options["total_episodes"] = 8 + 2 * slide.ROLLOUTS
+        rollouts = slide.make_models(seed, 2, iterations=1, rollouts=5) if models else None
+        return slide.make_ppo(seed, env=envs, models=rollouts, controller=mpc, options=options, **changes)
 
-    return LCSRL(warmup, 8 * STEPS, make_main)
+    return LCSRL(warmup, 8 * slide.STEPS, make_main)
 
 
 def test_phases_follow_each_other():
@@ -38,7 +28,9 @@ def test_phases_follow_each_other():
     reports = [trainer.step() for _ in range(5)]
     assert [type(report).__name__ for report in reports] == ["WarmupReport"] * 3 + ["PPOReport"] * 2
     assert [report.iteration for report in reports] == [1, 2, 3, 4, 5]
-    assert [report.env_steps for report in reports] == [STEPS * n for n in (2, 5, 8, 8 + ROLLOUTS, 8 + 2 * ROLLOUTS)]
+    assert [report.env_steps for report in reports] == [
+        slide.STEPS * n for n in (2, 5, 8, 8 + slide.ROLLOUTS, 8 + 2 * slide.ROLLOUTS)
+    ]
 
 
 def test_episodes_of_both_phases_differ():
@@ -52,7 +44,7 @@ def test_episodes_of_both_phases_differ():
         del env.reset
         seeds[-1] = seeds[-1][: trainer.episodes - count]
     flat = [seed for part in seeds for seed in part]
-    assert len(set(flat)) == len(flat) == 8 + 2 * ROLLOUTS
+    assert len(set(flat)) == len(flat) == 8 + 2 * slide.ROLLOUTS
 
 
 def test_a_trainer_goes_back_to_a_phase():
@@ -62,13 +54,13 @@ def test_a_trainer_goes_back_to_a_phase():
     early = copy_state(trainer.state_dict())
     for _ in range(3):
         trainer.step()
-    late, state = parameters(trainer), copy_state(trainer.state_dict())
+    late, state = slide.parameters(trainer), copy_state(trainer.state_dict())
     trainer.load(early)
     assert isinstance(trainer.current, Warmup)
-    assert (trainer.iteration, trainer.env_steps) == (1, 2 * STEPS)
+    assert (trainer.iteration, trainer.env_steps) == (1, 2 * slide.STEPS)
     trainer.load(state)
     assert isinstance(trainer.current, PPO)
-    assert same(late, parameters(trainer))
+    assert slide.same(late, slide.parameters(trainer))
 
 
 def test_the_main_phase_remembers_the_warm_up():
@@ -77,7 +69,7 @@ def test_the_main_phase_remembers_the_warm_up():
         trainer.step()
     assert len(trainer.current.models) == 8
     trainer.step()
-    assert len(trainer.current.models) == 8 + ROLLOUTS
+    assert len(trainer.current.models) == 8 + slide.ROLLOUTS
 
 
 def test_what_is_handed_out_is_bounded_on_states_of_the_warm_up():

@@ -8,20 +8,7 @@ import torch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
-from difflcs import (
-    ConstraintSequence,
-    CostSequence,
-    GoalCost,
-    LCSModel,
-    LCSMPCLayer,
-    LCSParams,
-    LinearConstraints,
-    QuadraticCost,
-    StageBounds,
-    prediction_loss,
-    solve_lcp,
-    violation_loss,
-)
+import difflcs
 from difflcs import errors as e
 from difflcs._checks import check_tensor
 from difflcs.mpc import MPCProblem, Primal
@@ -85,19 +72,19 @@ def entry(build, name, model):
     n = build.normal(0)
     x, u, goal = n(5, 4), n(5, 2), n(5, 3)
     limits = {"u_min": -torch.ones(2).double(), "u_max": torch.ones(2).double()}
-    reach = GoalCost.reach(4, 2, goal_weight=(1.0, 1.0, 1.0))
+    reach = difflcs.GoalCost.reach(4, 2, goal_weight=(1.0, 1.0, 1.0))
     plan = {"x": torch.zeros(5, 3, 4).double(), "u": torch.zeros(5, 2, 2).double(), "lam": torch.ones(5, 2, 3).double()}
     table = {
-        "solve_lcp": lambda: (solve_lcp, {"F": torch.eye(3).double(), "q": torch.ones(2, 3).double()}),
-        "LCSParams": lambda: (LCSParams, build.lcs_tensors()),
-        "violation_loss": lambda: (lambda **t: violation_loss(model, **t), {"x": x, "u": u, "x_next": x}),
-        "prediction_loss": lambda: (lambda **t: prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
+        "solve_lcp": lambda: (difflcs.solve_lcp, {"F": torch.eye(3).double(), "q": torch.ones(2, 3).double()}),
+        "LCSParams": lambda: (difflcs.LCSParams, build.lcs_tensors()),
+        "violation_loss": lambda: (lambda **t: difflcs.violation_loss(model, **t), {"x": x, "u": u, "x_next": x}),
+        "prediction_loss": lambda: (lambda **t: difflcs.prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
         "forward": lambda: (model, {"x": x, "u": u}),
         "rollout": lambda: (
             lambda **t: (model.rollout(**t), model.params().rollout(**t)),
             {"x0": x, "u_seq": n(5, 3, 2)},
         ),
-        "QuadraticCost": lambda: (QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
+        "QuadraticCost": lambda: (difflcs.QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
         "GoalCost": lambda: (reach, {"goal": goal}),
         "layer": lambda: (lambda **t: layer(build, **t), limits),
         "call": lambda: (layer(build, lcs=model, cost=reach), {"x0": x, "goal": goal, **limits}),
@@ -157,31 +144,31 @@ def test_parameters_that_are_not_finite_are_refused(build, name, function):
 
 def layer(build, **changes):
     options = {"lcs": build.params(), "cost": build.cost(), "horizon": 2, "u_min": -0.1, "u_max": 0.1, **changes}
-    return LCSMPCLayer(**options)
+    return difflcs.LCSMPCLayer(**options)
 
 
 X, ONE, EYE = torch.zeros(4).double(), torch.ones(2).double(), torch.eye(3).double()
 SKEW = torch.tensor([[1.0, 3, 0], [0, 1, 0], [0, 0, 1]]).double()
 FITS_NOT = {  # what does not fit, the error, and what it says
-    "F of another size": (lambda b: solve_lcp(EYE, torch.ones(4).double()), e.ShapeError,
+    "F of another size": (lambda b: difflcs.solve_lcp(EYE, torch.ones(4).double()), e.ShapeError,
      r"F: expected shape \(\.\.\., n=4, n=4\), got \(3, 3\)"),
-    "q without dimension": (lambda b: solve_lcp(EYE, ONE[0]), e.ShapeError, r"q: expected shape \(\.\.\., n\)"),
-    "batches of an LCP": (lambda b: solve_lcp(EYE.expand(2, 3, 3), torch.ones(5, 3).double()), e.ShapeError,
+    "q without dimension": (lambda b: difflcs.solve_lcp(EYE, ONE[0]), e.ShapeError, r"q: expected shape \(\.\.\., n\)"),
+    "batches of an LCP": (lambda b: difflcs.solve_lcp(EYE.expand(2, 3, 3), torch.ones(5, 3).double()), e.ShapeError,
      r"batch dimensions.*\(2,\).*\(5,\)|batch dimensions.*\(5,\).*\(2,\)"),
-    "a vector for a matrix": (lambda b: LCSParams(**{**b.lcs_tensors(), "A": X}), e.ShapeError,
+    "a vector for a matrix": (lambda b: difflcs.LCSParams(**{**b.lcs_tensors(), "A": X}), e.ShapeError,
      r"A: expected a matrix .*got \(4,\)"),
     "batches of a system": (
-     lambda b: LCSParams(**{**b.lcs_tensors(), "d": X.expand(2, 4), "c": torch.ones(5, 3).double()}), e.ShapeError,
-     r"batch dimensions \(5,\) do not fit.*d \(2,\)"),
-    "mixed dtypes": (lambda b: LCSParams(**{**b.lcs_tensors(), "B": torch.zeros(4, 2)}), e.DTypeError,
+     lambda b: difflcs.LCSParams(**{**b.lcs_tensors(), "d": X.expand(2, 4), "c": torch.ones(5, 3).double()}),
+     e.ShapeError, r"batch dimensions \(5,\) do not fit.*d \(2,\)"),
+    "mixed dtypes": (lambda b: difflcs.LCSParams(**{**b.lcs_tensors(), "B": torch.zeros(4, 2)}), e.DTypeError,
      "float32.*float64|float64.*float32"),
-    "batches of a loss": (lambda b: violation_loss(b.model(), X.expand(5, 4), ONE.expand(3, 2), X.expand(5, 4)),
+    "batches of a loss": (lambda b: difflcs.violation_loss(b.model(), X.expand(5, 4), ONE.expand(3, 2), X.expand(5, 4)),
      e.ShapeError, r"batch dimensions \(3,\) do not fit"),
     "data of another dtype": (lambda b: b.model()(X.float(), ONE), e.DTypeError,
      r"x: expected torch.float64 like the model, got .*float32.*model.to\(torch.float32\)"),
     "a sequence without steps": (lambda b: b.model().rollout(X, ONE), e.ShapeError,
      r"u_seq: expected shape \(\.\.\., T, n_u=2\), got \(2,\)"),
-    "another dtype of a model": (lambda b: LCSModel(2, 2, 2, dtype=torch.float16), e.DTypeError,
+    "another dtype of a model": (lambda b: difflcs.LCSModel(2, 2, 2, dtype=torch.float16), e.DTypeError,
      "dtype: expected torch.float32 or torch.float64, got torch.float16"),
     "a guess of another horizon": (lambda b: layer(b)(X, guess=layer(b, horizon=3)(X)), e.ShapeError,
      r"guess.x: expected shape \(\.\.\., H\+1=3, n_x=4\), got \(4, 4\)"),
@@ -200,12 +187,12 @@ FITS_NOT = {  # what does not fit, the error, and what it says
     "batches of a layer": (lambda b: layer(b, lcs=b.params(batch=(2,)))(X.expand(3, 4)), e.ShapeError,
      r"batch dimensions .* do not fit.*x0 \(3,\)"),
     "a goal of another batch": (
-     lambda b: layer(b, cost=GoalCost.reach(4, 2))(X.expand(3, 4), reference=X.expand(2, 3, 4)), e.ShapeError,
+     lambda b: layer(b, cost=difflcs.GoalCost.reach(4, 2))(X.expand(3, 4), reference=X.expand(2, 3, 4)), e.ShapeError,
      r"^reference: its batch dimensions \(2,\) do not fit the others \(x0 \(3,\), reference \(2,\)\)"),
     "a backend that is none": (lambda b: layer(b, backend="gurobi"), e.BackendNotFoundError,
      "expected one of .*'ipopt'.*got 'gurobi'.*register_backend"),
-    "infinities that cancel": (lambda b: solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()), e.NonFiniteError,
-     "q: expected finite numbers, got 2"),
+    "infinities that cancel": (lambda b: difflcs.solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()),
+     e.NonFiniteError, "q: expected finite numbers, got 2"),
 }  # fmt: skip
 
 
@@ -219,7 +206,7 @@ def test_what_does_not_fit_is_refused(build, case):
 def test_an_F_that_is_not_positive_definite_is_refused_with_its_eigenvalue(build, F):
     smallest = float(torch.linalg.eigvalsh(F + F.T)[0])
     match = rf"F \+ Fᵀ positive definite, got smallest eigenvalue {re.escape(f'{smallest:.3e}')}.*add to the diagonal"
-    refuse(e.NotPositiveDefiniteError, match, lambda: LCSParams(**{**build.lcs_tensors(), "F": F}))
+    refuse(e.NotPositiveDefiniteError, match, lambda: difflcs.LCSParams(**{**build.lcs_tensors(), "F": F}))
 
 
 def test_finite_numbers_whose_sum_overflows_are_accepted():
@@ -230,16 +217,16 @@ def test_finite_numbers_whose_sum_overflows_are_accepted():
 # --- numbers --------------------------------------------------------------------------------------------------------
 
 NUMBERS = {  # what takes a number by a name, numbers out of its range, and what else it refuses
-    "relaxation of an LCP": (lambda b, v: solve_lcp(EYE, X[:3], v), (-1e-9, NAN, INF, -INF), "at least 0"),
-    "time_limit": (lambda b, v: solve_lcp(EYE, X[:3], time_limit=v), (0.0, -1.0, NAN, INF), "above 0"),
-    "stiffness": (lambda b, v: LCSModel(2, 2, 2, v), (0.0, -0.1, NAN, INF), "above 0"),
-    "gamma": (lambda b, v: violation_loss(b.model(), X, ONE, X, gamma=v), (0.0, -1.0, NAN, INF), ""),
-    "xi": (lambda b, v: violation_loss(b.model(), X, ONE, X, xi=v), (0.0, -1.0, NAN, INF), ""),
+    "relaxation of an LCP": (lambda b, v: difflcs.solve_lcp(EYE, X[:3], v), (-1e-9, NAN, INF, -INF), "at least 0"),
+    "time_limit": (lambda b, v: difflcs.solve_lcp(EYE, X[:3], time_limit=v), (0.0, -1.0, NAN, INF), "above 0"),
+    "stiffness": (lambda b, v: difflcs.LCSModel(2, 2, 2, v), (0.0, -0.1, NAN, INF), "above 0"),
+    "gamma": (lambda b, v: difflcs.violation_loss(b.model(), X, ONE, X, gamma=v), (0.0, -1.0, NAN, INF), ""),
+    "xi": (lambda b, v: difflcs.violation_loss(b.model(), X, ONE, X, xi=v), (0.0, -1.0, NAN, INF), ""),
     "relaxation": (lambda b, v: layer(b, relaxation=v), (0.0, -1e-5, NAN, INF), "above 0"),
     "horizon": (lambda b, v: layer(b, horizon=v), (0, -1), "at least 1"),
-    "n_x": (lambda b, v: LCSModel(v, 2, 2), (0, -3), "at least 1"),
-    "n_u": (lambda b, v: LCSModel(2, v, 2), (0, -3), "at least 1"),
-    "n_lam": (lambda b, v: LCSModel(2, 2, v), (-1, -3), "at least 0"),  # without contacts a system is linear
+    "n_x": (lambda b, v: difflcs.LCSModel(v, 2, 2), (0, -3), "at least 1"),
+    "n_u": (lambda b, v: difflcs.LCSModel(2, v, 2), (0, -3), "at least 1"),
+    "n_lam": (lambda b, v: difflcs.LCSModel(2, 2, v), (-1, -3), "at least 0"),  # without contacts a system is linear
 }
 
 
@@ -270,17 +257,17 @@ def test_a_number_of_numpy_or_torch_is_a_number(build, one):
     for value in (backend.tol, backend.time_limit, mpc.relaxation, mpc.training_relaxation, mpc.barrier):
         assert type(value) in (int, float)
         assert value == 1
-    assert torch.equal(solve_lcp(F, q, one, one).lam, solve_lcp(F, q, 1.0).lam)
-    weights = GoalCost.reach(2, 2, goal_weight=one, input_weight=one, pairs=[(0, 1)], pair_weight=one)
-    assert torch.equal(weights.Q, GoalCost.reach(2, 2, pairs=[(0, 1)], pair_weight=1.0).Q)
+    assert torch.equal(difflcs.solve_lcp(F, q, one, one).lam, difflcs.solve_lcp(F, q, 1.0).lam)
+    weights = difflcs.GoalCost.reach(2, 2, goal_weight=one, input_weight=one, pairs=[(0, 1)], pair_weight=one)
+    assert torch.equal(weights.Q, difflcs.GoalCost.reach(2, 2, pairs=[(0, 1)], pair_weight=1.0).Q)
     full = torch.ones(2).double()
-    assert torch.equal(StageBounds(-by_stage, one).u_max, full)
-    assert torch.equal(LinearConstraints(F, q, weight=one).weight, full)
-    assert torch.equal(ConstraintSequence(F, by_stage, weight=one, by_stage=("g",)).weight, full)
+    assert torch.equal(difflcs.StageBounds(-by_stage, one).u_max, full)
+    assert torch.equal(difflcs.LinearConstraints(F, q, weight=one).weight, full)
+    assert torch.equal(difflcs.ConstraintSequence(F, by_stage, weight=one, by_stage=("g",)).weight, full)
     data = torch.ones(3, 4).double(), torch.ones(3, 2).double(), torch.ones(3, 4).double()
-    model = LCSModel(4, np.int64(2), 3, init_scale=one, stiffness=one)
+    model = difflcs.LCSModel(4, np.int64(2), 3, init_scale=one, stiffness=one)
     assert type(model.n_u) is int
-    assert torch.isfinite(violation_loss(model, *data, gamma=0.1, xi=one))
+    assert torch.isfinite(difflcs.violation_loss(model, *data, gamma=0.1, xi=one))
 
 
 # --- bounds ---------------------------------------------------------------------------------------------------------
@@ -337,11 +324,11 @@ def problem(build, **change):
 
 def rows(build, **change):
     n = build.normal(0)
-    return LinearConstraints(**{"G": n(3, 4), "g": n(3), "E": n(3, 2), "weight": full(2.0, 3), **change})
+    return difflcs.LinearConstraints(**{"G": n(3, 4), "g": n(3), "E": n(3, 2), "weight": full(2.0, 3), **change})
 
 
 def rows_by_stage(build, **change):
-    return ConstraintSequence(
+    return difflcs.ConstraintSequence(
         **{"G": full(1.0, 4, 3, 4), "g": full(1.0, 4, 3), "E": full(1.0, 3, 3, 2), "weight": 1.0, **change}
     )
 
@@ -350,7 +337,7 @@ def cost_by_stage(build, **change):
     each = [build.cost_tensors(k) for k in range(3)]
     fields = {name: torch.stack([t[name] for t in each]) for name in ("Q", "R", "q", "r")}
     fields |= {k: each[0][k] for k in ("Q_final", "q_final")} | {"S": full(0.0, 3, 4, 2)}
-    return CostSequence(**{**fields, **change})
+    return difflcs.CostSequence(**{**fields, **change})
 
 
 LOW, SUPPORT = full(-1.0, 3, 2), torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)
@@ -369,7 +356,7 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"u_max": full(INF, 2), "barrier": 0.1}, e.BoundsError, "finite bounds with a barrier"),
         ({"u_min": ONE}, e.BoundsError, "u_min <= u_max, got 1.*0.1"),
     ]),
-    "StageBounds": (lambda b, u_min=LOW, u_max=None: StageBounds(u_min, u_max), [
+    "StageBounds": (lambda b, u_min=LOW, u_max=None: difflcs.StageBounds(u_min, u_max), [
         ({"u_min": full(0.1, 3, 2), "u_max": full(-0.1, 3, 2)}, e.BoundsError,
          r"u_min <= u_max, got 0.1 and -0.1 at index \(0, 0\)"),
         ({"u_min": full(INF, 3, 2)}, e.BoundsError, "u_min: expected at least one action that it allows"),
@@ -418,7 +405,7 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"S": full(0.0, 3, 2, 4)}, e.ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\)"),
         ({"S": torch.stack([full(0.0, 4, 2), full(30.0, 4, 2), full(0.0, 4, 2)])}, e.InvalidInputError, r"\[\[Q, S\]"),
     ]),
-    "GoalCost.reach": (lambda b, n_x=3, n_u=2, **change: GoalCost.reach(n_x, n_u, **change), [
+    "GoalCost.reach": (lambda b, n_x=3, n_u=2, **change: difflcs.GoalCost.reach(n_x, n_u, **change), [
         ({"goal_weight": (1.0, 2.0, 3.0, 4.0)}, e.ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 4"),
         ({"goal_weight": ()}, e.ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 0"),
         ({"goal_weight": -1.0}, e.InvalidInputError, "goal_weight: .*at least 0, got -1"),
@@ -431,7 +418,7 @@ REFUSED = {  # a call that is right as it is, and what it refuses: changed argum
         ({"n_x": 0}, e.InvalidInputError, "n_x: expected at least 1, got 0"),
         ({"dtype": torch.float16}, e.DTypeError, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
     ]),
-    "LCSModel": (lambda b, support=SUPPORT: LCSModel(4, 2, 3, action_support=support), [
+    "LCSModel": (lambda b, support=SUPPORT: difflcs.LCSModel(4, 2, 3, action_support=support), [
         ({"support": SUPPORT[0]}, e.ShapeError, "action_support|u_min"),
         ({"support": SUPPORT.flip(0)}, e.BoundsError, "action_support|u_min"),
         ({"support": SUPPORT * NAN}, e.NonFiniteError, "action_support|u_min"),

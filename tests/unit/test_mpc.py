@@ -12,20 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs import (
-    ConstraintSequence,
-    CostSequence,
-    GoalCost,
-    LCSMPCLayer,
-    LCSParams,
-    LCSSequence,
-    LinearConstraints,
-    MPCSolution,
-    QuadraticCost,
-    SolveError,
-    StageBounds,
-    Status,
-)
+import difflcs
 from difflcs.errors import BatchIndexError, BoundsError, DTypeError, ShapeError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import Backend, BatchedBackend, certify
@@ -50,7 +37,7 @@ class Flaky(Backend):
         for i in self.fail:
             for value in primal:
                 value[i] = self.garbage
-            status[i] = Status.MAX_ITER
+            status[i] = difflcs.Status.MAX_ITER
         return certify(problem, primal, status, result.iterations, result.solve_time, tol=1e-6)
 
 
@@ -78,7 +65,9 @@ class Recorder(Backend):
 
 @pytest.fixture
 def layer(build):
-    return LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
+    return difflcs.LCSMPCLayer(
+        build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4
+    )
 
 
 @pytest.fixture
@@ -88,7 +77,7 @@ def x0(build):
 
 def make_layer(build, seed=3, **options):
     options = {"lcs": build.params(seed), "cost": build.cost(seed), "backend": SOLVER, "relaxation": 1e-4, **options}
-    return LCSMPCLayer(horizon=3, u_min=-0.15, u_max=0.15, **options)
+    return difflcs.LCSMPCLayer(horizon=3, u_min=-0.15, u_max=0.15, **options)
 
 
 # --- shapes ---------------------------------------------------------------------------------------------------------
@@ -96,7 +85,7 @@ def make_layer(build, seed=3, **options):
 
 def test_leading_dimensions_of_states_and_systems_broadcast_and_are_kept(build, layer, x0):
     one, flat, folded = layer(x0[0]), layer(x0), layer(x0.T.contiguous().T.reshape(2, 1, 3, 4))
-    assert isinstance(one, MPCSolution)
+    assert isinstance(one, difflcs.MPCSolution)
     assert (one.x.shape, one.u.shape, one.lam.shape, one.action.shape) == ((4, 4), (3, 2), (3, 3), (2,))
     for scalar in (one.objective, one.status, one.iterations, one.kkt_residual, one.solve_time, one.converged):
         assert scalar.shape == ()
@@ -105,7 +94,7 @@ def test_leading_dimensions_of_states_and_systems_broadcast_and_are_kept(build, 
     assert folded.status.shape == folded.objective.shape == folded.complementarity().shape == (2, 1, 3)
     assert torch.equal(one.u, flat.u[0])
     assert torch.equal(folded.u.reshape(6, 3, 2), flat.u)
-    grid = LCSParams(**{k: v.expand(2, 3, *v.shape) for k, v in layer.lcs.params().tensors().items()})
+    grid = difflcs.LCSParams(**{k: v.expand(2, 3, *v.shape) for k, v in layer.lcs.params().tensors().items()})
     assert torch.equal(layer(x0[0], lcs=grid).u, one.u.expand(2, 3, 3, 2))
 
 
@@ -137,13 +126,13 @@ def test_a_plan_stays_within_the_actions_that_the_model_was_fitted_to(build, lay
     held = layer(x0).u.detach()
     assert bool(((held >= low) & (held <= high)).all())
     assert not torch.allclose(held, free)
-    other = LCSMPCLayer(layer.lcs.params(), layer.cost, 3, low, high, backend=SOLVER, relaxation=1e-4)
+    other = difflcs.LCSMPCLayer(layer.lcs.params(), layer.cost, 3, low, high, backend=SOLVER, relaxation=1e-4)
     torch.testing.assert_close(held, other(x0).u.detach(), rtol=0, atol=1e-12)
     # What a call asks for comes first, and stages are bounds of one's own.
     torch.testing.assert_close(layer(x0, u_min=-0.15, u_max=0.15).u.detach(), free, rtol=0, atol=1e-12)
-    stages = StageBounds(torch.full((3, 2), -0.15, dtype=torch.float64), 0.15)
+    stages = difflcs.StageBounds(torch.full((3, 2), -0.15, dtype=torch.float64), 0.15)
     torch.testing.assert_close(layer(x0, bounds=stages).u.detach(), free, rtol=0, atol=1e-7)
-    refuse(BoundsError, "action_support to None", LCSMPCLayer, layer.lcs, layer.cost, 3, 0.02, 0.15)
+    refuse(BoundsError, "action_support to None", difflcs.LCSMPCLayer, layer.lcs, layer.cost, 3, 0.02, 0.15)
     layer.lcs.action_support = None
     torch.testing.assert_close(layer(x0).u.detach(), free, rtol=0, atol=1e-12)
 
@@ -151,7 +140,7 @@ def test_a_plan_stays_within_the_actions_that_the_model_was_fitted_to(build, lay
 def test_learned_bounds_at_the_action_support_have_their_gradient(build, x0):
     low, high = (nn.Parameter(torch.full((2,), v, dtype=torch.float64)) for v in (-0.01, 0.01))
     model = build.model(seed=3, scale=0.4)
-    layer = LCSMPCLayer(model, build.cost(0), 3, low, high, backend=SOLVER, relaxation=1e-4)
+    layer = difflcs.LCSMPCLayer(model, build.cost(0), 3, low, high, backend=SOLVER, relaxation=1e-4)
     layer(x0).u.sum().backward()
     wanted = low.grad.clone(), high.grad.clone()
     assert float(wanted[0].abs().max()) > 0
@@ -166,10 +155,10 @@ def test_learned_bounds_at_the_action_support_have_their_gradient(build, x0):
 
 
 def test_raise_names_the_elements_and_their_status(build, x0):
-    with pytest.raises(SolveError, match=r"2 of 6 .*2 MAX_ITER.*elements 1, 4.*on_failure=\"mask\"") as error:
+    with pytest.raises(difflcs.SolveError, match=r"2 of 6 .*2 MAX_ITER.*elements 1, 4.*on_failure=\"mask\"") as error:
         make_layer(build, backend=Flaky(fail=(1, 4)))(x0)
     assert error.value.elements == (1, 4)
-    assert error.value.status == (Status.MAX_ITER, Status.MAX_ITER)
+    assert error.value.status == (difflcs.Status.MAX_ITER, difflcs.Status.MAX_ITER)
 
 
 @pytest.mark.parametrize("fail", [(1, 4), tuple(range(6))])
@@ -177,7 +166,7 @@ def test_raise_names_the_elements_and_their_status(build, x0):
 def test_mask_gives_the_failed_no_gradient_and_leaves_the_others_alone(build, x0, fail, garbage):
     others, results = [i for i in range(6) if i not in fail], []
     for backend, start in ((Flaky(), x0[others]), (Flaky(fail=fail, garbage=garbage), x0)):
-        cost = QuadraticCost(**build.cost_tensors(3), constant=nn.Parameter(torch.zeros(()).double()))
+        cost = difflcs.QuadraticCost(**build.cost_tensors(3), constant=nn.Parameter(torch.zeros(()).double()))
         layer = make_layer(build, 3, lcs=build.model(3, scale=0.4), cost=cost, backend=backend, on_failure="mask")
         start = start.clone().requires_grad_()
         with warnings.catch_warnings():
@@ -193,7 +182,7 @@ def test_mask_gives_the_failed_no_gradient_and_leaves_the_others_alone(build, x0
     torch.testing.assert_close(bad_grad[others], good_grad)
     torch.testing.assert_close(bad_shared, good_shared)
     assert not bad_grad[list(fail)].any()
-    assert bad.status.tolist() == [Status.MAX_ITER if i in fail else Status.CONVERGED for i in range(6)]
+    assert bad.status.tolist() == [difflcs.Status.MAX_ITER if i in fail else difflcs.Status.CONVERGED for i in range(6)]
     for value in (bad.x, bad.u, bad.lam, bad.objective, bad.kkt_residual):
         assert bool(torch.isfinite(value).all())
     assert float(bad.u.detach().abs().max()) <= 0.15
@@ -224,7 +213,7 @@ def test_a_backend_that_claims_success_is_judged_by_the_residual(build, x0):
                 problem, result.primal._replace(u=u), result.status, result.iterations, result.solve_time, tol=1e-6
             )
 
-    refuse(SolveError, r"2 of 6 .*2 NUMERICAL.*elements 3, 5", make_layer(build, backend=Liar()), x0)
+    refuse(difflcs.SolveError, r"2 of 6 .*2 NUMERICAL.*elements 3, 5", make_layer(build, backend=Liar()), x0)
 
 
 # --- what a problem may be ------------------------------------------------------------------------------------------
@@ -233,7 +222,7 @@ def test_a_backend_that_claims_success_is_judged_by_the_residual(build, x0):
 def recording(build, **options):
     backend = Recorder()
     options = {"lcs": build.params(3), "cost": build.cost(3), "horizon": 3, **options}
-    return LCSMPCLayer(**options, backend=backend), backend
+    return difflcs.LCSMPCLayer(**options, backend=backend), backend
 
 
 def test_a_backend_may_have_a_time_limit_that_is_no_option_of_it(build, x0):
@@ -241,22 +230,22 @@ def test_a_backend_may_have_a_time_limit_that_is_no_option_of_it(build, x0):
         time_limit = 5.0
 
     backend = Limited()
-    LCSMPCLayer(build.params(3), build.cost(3), 3, backend=backend)(x0)
+    difflcs.LCSMPCLayer(build.params(3), build.cost(3), 3, backend=backend)(x0)
     assert len(backend.seen) == 1
 
 
 @pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])
 def test_what_a_call_is_given_replaces_the_layers_own(build, x0, name):
     n = build.normal(7)
-    rows = [LinearConstraints(n(2, 4), torch.full((2,), g).double(), weight=1.0) for g in (1.0, 0.02)]
-    bounds = [StageBounds(torch.full((3, 2), -b).double(), 0.1) for b in (0.1, 0.02)]
+    rows = [difflcs.LinearConstraints(n(2, 4), torch.full((2,), g).double(), weight=1.0) for g in (1.0, 0.02)]
+    bounds = [difflcs.StageBounds(torch.full((3, 2), -b).double(), 0.1) for b in (0.1, 0.02)]
     first = {"lcs": build.params(3), "cost": build.cost(3), "constraints": rows[0], "bounds": bounds[0]}
     other = {"lcs": build.params(4), "cost": build.cost(4), "constraints": rows[1], "bounds": bounds[1]}[name]
     options = {"horizon": 3, "backend": SOLVER, "relaxation": 1e-4}
-    layer, built = LCSMPCLayer(**first, **options), LCSMPCLayer(**{**first, name: other}, **options)
+    layer, built = difflcs.LCSMPCLayer(**first, **options), difflcs.LCSMPCLayer(**{**first, name: other}, **options)
     assert torch.equal(layer(x0, **{name: other}).u, built(x0).u)
     assert not torch.equal(layer(x0).u, built(x0).u)
-    assert torch.equal(layer(x0).u, LCSMPCLayer(**first, **options)(x0).u)
+    assert torch.equal(layer(x0).u, difflcs.LCSMPCLayer(**first, **options)(x0).u)
 
 
 # --- modules that say the system ------------------------------------------------------------------------------------
@@ -268,27 +257,29 @@ def ones(*shape):
 
 # By keyword what does not fit, the error, and what it says; a layer refuses the first ones too, where it is built.
 FITS_NOT_A_LAYER = [
-    (lambda b: {"bounds": StageBounds(-ones(3, 3), 1.0)}, ShapeError, "bounds: expected n_u=2 like the LCS, got n_u=3"),
-    (lambda b: {"bounds": StageBounds(-ones(5, 2), 1.0)}, ShapeError,
+    (lambda b: {"bounds": difflcs.StageBounds(-ones(3, 3), 1.0)}, ShapeError,
+     "bounds: expected n_u=2 like the LCS, got n_u=3"),
+    (lambda b: {"bounds": difflcs.StageBounds(-ones(5, 2), 1.0)}, ShapeError,
      "bounds: expected 3 stages, the layer's horizon, got 5; give one for each"),
     (lambda b: {"bounds": (-1, 1)}, DTypeError, r"bounds: expected StageBounds, got tuple \(-1, 1\); pass constant"),
-    (lambda b: {"bounds": StageBounds(-ones(3, 2), 1.0), "u_min": 0.0}, ShapeError,
+    (lambda b: {"bounds": difflcs.StageBounds(-ones(3, 2), 1.0), "u_min": 0.0}, ShapeError,
      "u_min: expected none with bounds, got float 0.0; put it"),
-    (lambda b: {"constraints": [LinearConstraints(ones(2, 4), ones(2))]}, DTypeError,
+    (lambda b: {"constraints": [difflcs.LinearConstraints(ones(2, 4), ones(2))]}, DTypeError,
      "constraints: expected LinearConstraints or ConstraintSequence, got list"),
-    (lambda b: {"constraints": LinearConstraints(ones(2, 5), ones(2))}, ShapeError,
+    (lambda b: {"constraints": difflcs.LinearConstraints(ones(2, 5), ones(2))}, ShapeError,
      "constraints: expected n_x=4 like the LCS, got n_x=5"),
-    (lambda b: {"constraints": LinearConstraints(ones(2, 4), ones(2), ones(2, 3))}, ShapeError,
+    (lambda b: {"constraints": difflcs.LinearConstraints(ones(2, 4), ones(2), ones(2, 3))}, ShapeError,
      "constraints: expected n_u=2 like the LCS, got n_u=3"),
-    (lambda b: {"constraints": ConstraintSequence(ones(2, 4), ones(5, 2), by_stage=("g",))}, ShapeError,
+    (lambda b: {"constraints": difflcs.ConstraintSequence(ones(2, 4), ones(5, 2), by_stage=("g",))}, ShapeError,
      "constraints: expected 3 stages, .* got 4"),
-    (lambda b: {"cost": CostSequence(**{**b.cost_tensors(3), "q": ones(4, 4)}, by_stage=("q",))}, ShapeError,
+    (lambda b: {"cost": difflcs.CostSequence(**{**b.cost_tensors(3), "q": ones(4, 4)}, by_stage=("q",))}, ShapeError,
      "cost: expected 3 stages, .* got 4"),
 ]  # fmt: skip
 FITS_NOT_A_CALL = [
-    (lambda b: {"lcs": LCSSequence.stack([b.params(3)] * 2)}, ShapeError, "lcs: expected 3 stages, .*horizon, got 2"),
+    (lambda b: {"lcs": difflcs.LCSSequence.stack([b.params(3)] * 2)}, ShapeError,
+     "lcs: expected 3 stages, .*horizon, got 2"),
     (lambda b: {"lcs": b.params(3, n_x=5)}, ShapeError, r"x0: expected shape \(\.\.\., n_x=5\), got \(6, 4\)"),
-    (lambda b: {"constraints": LinearConstraints(ones(2, 4), ones(5, 2))}, ShapeError,
+    (lambda b: {"constraints": difflcs.LinearConstraints(ones(2, 4), ones(5, 2))}, ShapeError,
      r"batch dimensions .* do not fit.*x0 \(6,\)"),
     (lambda b: {"lcs": SimpleNamespace(n_x=4, n_u=2, n_lam=3, params=lambda x, context: {})}, DTypeError,
      "lcs: expected LCSParams or LCSSequence, got dict.*; return one of them from SimpleNamespace.params"),
@@ -306,7 +297,7 @@ FITS_NO_GOAL = [
 @pytest.mark.parametrize(("options", "error", "message"), [*FITS_NOT_A_LAYER, *FITS_NOT_A_CALL, *FITS_NO_GOAL])
 def test_calls_that_do_not_fit_are_refused(build, x0, options, error, message):
     has_goal = any(message is words for _, _, words in FITS_NO_GOAL)
-    layer, backend = recording(build, cost=GoalCost.reach(4, 2, 1.0) if has_goal else build.cost(3))
+    layer, backend = recording(build, cost=difflcs.GoalCost.reach(4, 2, 1.0) if has_goal else build.cost(3))
     assert ";" in refuse(error, message, layer, x0, **options(build))
     assert not backend.seen
     if any(message is words for _, _, words in FITS_NOT_A_LAYER):
@@ -315,7 +306,7 @@ def test_calls_that_do_not_fit_are_refused(build, x0, options, error, message):
 
 
 def test_a_guess_may_leave_out_the_multipliers(build, x0):
-    rows = LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double())
+    rows = difflcs.LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double())
     layer, backend = recording(build, constraints=rows)
     full = layer(x0)
     assert full.mu.shape == (6, 4, 2)
@@ -333,8 +324,8 @@ def test_a_guess_may_leave_out_the_multipliers(build, x0):
 
 def test_learned_bounds_and_constraints_are_saved_and_old_states_are_read(build, x0):
     def make(g, low):
-        bounds = StageBounds(nn.Parameter(torch.full((3, 2), low).double()), 0.1)
-        rows = LinearConstraints(build.normal(0)(2, 4), nn.Parameter(torch.full((2,), g).double()))
+        bounds = difflcs.StageBounds(nn.Parameter(torch.full((3, 2), low).double()), 0.1)
+        rows = difflcs.LinearConstraints(build.normal(0)(2, 4), nn.Parameter(torch.full((2,), g).double()))
         return recording(build, lcs=build.model(3), bounds=bounds, constraints=rows)
 
     (layer, backend), (other, _) = make(1.0, -0.1), make(2.0, -0.2)
@@ -349,8 +340,10 @@ def test_learned_bounds_and_constraints_are_saved_and_old_states_are_read(build,
 
 
 def test_a_single_layer_moves_with_its_parts(build, x0):
-    rows = LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double(), weight=1.0)
-    layer, backend = recording(build, lcs=build.model(3), constraints=rows, bounds=StageBounds(-torch.ones(3, 2), 1.0))
+    rows = difflcs.LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double(), weight=1.0)
+    layer, backend = recording(
+        build, lcs=build.model(3), constraints=rows, bounds=difflcs.StageBounds(-torch.ones(3, 2), 1.0)
+    )
     layer.float()
     assert layer.constraints.G.dtype == layer.bounds.u_min.dtype == torch.float32
     solution = layer(x0.float())
@@ -409,7 +402,7 @@ def test_a_plan_is_drawn(layer, x0):
 @pytest.mark.parametrize("backend", ["batched", "ipopt"])
 def test_a_plan_is_freed_without_the_garbage_collector(build, x0, backend):
     """Outputs kept by their own autograd node would form a cycle: memory would grow from call to call."""
-    layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=backend)
+    layer = difflcs.LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=backend)
     gc.collect()
     gc.disable()
     try:
