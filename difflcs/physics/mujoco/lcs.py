@@ -158,7 +158,7 @@ class MujocoLCS:
         budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None and torsion
         self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
-        self._parts = torch.rand(_BETWEEN, 1, model.nu, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        self._parts = torch.from_numpy(np.random.default_rng(0).random((_BETWEEN, 1, model.nu)))
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more = distance, length, budgets, friction, torsion, pushed
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")

@@ -205,6 +205,16 @@ class LearnableMujocoLCS(nn.Module):
         given = (change, x) if context is None else (change, x, check_tensor("context", context, [("n_u", self.n_u)]))
         return LCSParams(*solve(_Matrices(self, x.dtype, len(given)), *given))
 
+    def slopes_along(self, weights: Sequence[Tensor], x: Tensor, context: Tensor | None = None) -> Tensor:
+        """Compute the slopes (m, ..., n) of m weighted sums of the matrices by each parameter, at each state.
+
+        `weights` has those of each matrix (m, ..., *size), in the order of `LCSParams`; x and context as in `params`.
+        """
+        given = (self.change, x) if context is None else (self.change, x, context)
+        matrices = _Matrices(self, x.dtype, len(given))
+        matrices.solve(given, transformed=False)
+        return matrices.slopes(given, 0, weights)
+
     def summary(self) -> dict[str, list[float]]:
         """Return what is learned: factors of the model's values, or offsets in its units of length."""
         change, found = self.change.detach().tolist(), {}
@@ -290,25 +300,28 @@ class _Matrices(Solver):
         needs: Sequence[bool],
     ) -> list[Tensor | None]:
         """See `Solver`."""
+        found: list[Tensor | None] = []
+        for i, needed in enumerate(needs):
+            slopes = self.slopes(tensors, i, grads) if needed and tensors[i].shape[-1] else None
+            found.append(slopes if i or slopes is None else slopes.reshape(-1, slopes.shape[-1]).sum(0))
+        return found
+
+    def slopes(self, tensors: Sequence[Tensor], i: int, grads: Sequence[Tensor | None]) -> Tensor:
+        """Compute the slopes of the matrices along `grads`, which may be several, by each number of input i."""
         plain = [v.detach().double().cpu() for v in tensors]
         upstream = [None if g is None else g.double().cpu() for g in grads]
         ranks = [len(dims) for dims in SYSTEM.values()]
 
-        def moved(i: int, j: int, step: float) -> Tensor:
-            """Compute how far a step of number j of input i moves the matrices, along the gradient, for each state."""
+        def moved(j: int, step: float) -> Tensor:
+            """Compute how far a step of number j moves the matrices, along the gradient, for each state."""
             changed = list(plain)
             changed[i] = plain[i].clone()
             changed[i][..., j] += step
             pairs = zip(self._evaluate(changed), self.found, upstream, ranks, strict=True)
             return sum(((a - b) * g).flatten(g.ndim - r).sum(-1) for a, b, g, r in pairs if g is not None)  # pyright: ignore
 
-        found: list[Tensor | None] = []
-        for i, (value, needed) in enumerate(zip(plain, needs, strict=True)):
-            step = _STATE_STEP if i else _STEP
-            slopes = [slope(moved(i, j, step), moved(i, j, -step)) / step for j in range(value.shape[-1] * needed)]
-            slopes = [slope if i else slope.sum() for slope in slopes]
-            found.append(torch.stack(slopes, -1) if slopes else None)
-        return found
+        step = _STATE_STEP if i else _STEP
+        return torch.stack([slope(moved(j, step), moved(j, -step)) / step for j in range(plain[i].shape[-1])], -1)
 
 
 def slope(ahead: Tensor, behind: Tensor) -> Tensor:

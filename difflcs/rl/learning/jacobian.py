@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from difflcs.errors import DoubleBackwardError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
 from difflcs.records import SYSTEM, LCSParams, LCSSequence, system_at
@@ -50,6 +51,8 @@ def system_jacobian(
     weights = [torch.stack(parts, 1) for parts in zip(*upstream, strict=True)]  # of each matrix: (N, n_u, ...)
     if not system.batch_shape:
         return _pull_back(system, weights, learned)
+    if learned and hasattr(lcs, "slopes_along"):  # its derivatives are differences, two systems for each parameter
+        return lcs.slopes_along([w.transpose(0, 1) for w in weights], state, context).transpose(0, 1)
     if sum(p.numel() for p in learned) <= FEW_PARAMETERS:
         jacobian = _push_forward(system, weights, learned)
         if jacobian is not None:
@@ -75,7 +78,10 @@ def _push_forward(system: LCSParams | LCSSequence, weights: list[Tensor], learne
         if not fields:
             check_depends(weights[0])
         v = [torch.zeros_like(field, requires_grad=True) for field in fields]
-        pulled = torch.autograd.grad(fields, learned, v, create_graph=True, materialize_grads=True)
+        try:
+            pulled = torch.autograd.grad(fields, learned, v, create_graph=True, materialize_grads=True)
+        except DoubleBackwardError:
+            return None
         flat = torch.cat([g.reshape(-1) for g in pulled])
         if not flat.requires_grad:
             return None
