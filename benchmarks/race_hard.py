@@ -59,6 +59,7 @@ def draws() -> dict[str, tuple[str, Draw]]:
         numbers = {"weight": weight, "bound": bound, "growth": growth, "progress": progress}
         return {**numbers, "inner": int(random.choice([5, 10, 50])), "settle": settle}
 
+    rivals: dict[str, tuple[str, Draw]]
     rivals = {f"C3+, {n} iterations": ("admm", partial(consensus, iterations=n)) for n in ITERATIONS}
     rivals["C3, 10 iterations"] = ("admm", partial(consensus, iterations=10, project="lcp"))
     rivals["C3, 10 iterations, exact"] = ("admm", partial(consensus, iterations=10, project="exact"))
@@ -161,22 +162,13 @@ def measure(problems: int, seeds: int, rounds: int, only: tuple[str, ...] = ()) 
                 table[label]["steps"].append(seconds)
                 table[label]["costs"] += list(costs + STEPS * least)
         first = np.sum(table["difflcs"]["costs"])
-        families[family] = {
-            label: {
-                "seconds": float(np.median(row["times"])),
-                "gap": float(np.mean(row["gaps"])),
-                "worst": float(np.max(row["gaps"])),
-            }
-            | (
-                {"step": float(np.mean(row["steps"])), "cost": float(np.sum(row["costs"]) / first)}
-                if row["steps"]
-                else {}
-            )
-            for label, row in table.items()
-        }
-        for label, row in families[family].items():
-            print(
-                f"{family:20s} {label:32s} " + "  ".join(f"{name} {value:.4g}" for name, value in row.items()),
-                flush=True,
-            )
+        families[family] = {}
+        for label, row in table.items():
+            gaps = row["gaps"]
+            values = {"seconds": np.median(row["times"]), "gap": np.mean(gaps), "worst": np.max(gaps)}
+            if row["steps"]:
+                values |= {"step": np.mean(row["steps"]), "cost": np.sum(row["costs"]) / first}
+            families[family][label] = figures = {name: float(value) for name, value in values.items()}
+            text = "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            print(f"{family:20s} {label:32s} {text}", flush=True)
     return families

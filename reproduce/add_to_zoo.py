@@ -4,7 +4,6 @@ The run has to be one that learned a system for an MPC and was evaluated at its 
 task has for models, with the method behind it unless that is the default one. No part of the wheel.
 """
 
-import argparse
 import json
 import shlex
 import sys
@@ -12,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import tyro
 
 from difflcs import zoo
 from difflcs.errors import CheckpointError, DiffLCSError
@@ -23,7 +24,7 @@ from difflcs.rl.tasks import get_task
 
 
 def add(run: Path | str, *, force: bool = False, root: Path = zoo.MODELS) -> zoo.ModelCard:
-    """Write model and card.
+    """Add the model of a finished run to the zoo, with its card.
 
     Args:
         run: directory of `difflcs train`.
@@ -66,20 +67,16 @@ def _card(run: RunDirectory, config: TrainConfig, name: str) -> zoo.ModelCard:
         )
     described, versions = stored.get("object", {}), stored["versions"]
     zoo.check_object(described, run.path)
-    rate, low, high = (float(last[f"evaluation_{k}"]) for k in ("success_rate", "ci_low", "ci_high"))
-    goals, failures = (int(last[f"evaluation_{k}"]) for k in ("goals", "solver_failures"))
+    numbers: dict[str, Any] = {k: float(last[f"evaluation_{k}"]) for k in ("success_rate", "ci_low", "ci_high")}
+    numbers |= {k: int(last[f"evaluation_{k}"]) for k in ("goals", "solver_failures")}
     return zoo.ModelCard(
         name=name,
         task=config.task,
         method=config.method.name,
         minutes=config.minutes,
         seed=config.seed,
-        success_rate=rate,
-        ci_low=low,
-        ci_high=high,
-        goals=goals,
+        **numbers,
         evaluation_seed=config.evaluation_seed,
-        solver_failures=failures,
         object=described,
         backend=config.method.solver or "",
         version=str(versions["difflcs"]),
@@ -130,12 +127,8 @@ def _flag(name: str, value: object) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the script; return the exit code."""
-    parser = argparse.ArgumentParser(description="Add the model of a finished run to the zoo.")
-    parser.add_argument("run", type=Path, metavar="RUN", help="directory of `difflcs train`")
-    parser.add_argument("--force", action="store_true", help="replace a model of that name")
-    options = parser.parse_args(arguments)
     try:
-        card = add(options.run, force=options.force)
+        card = tyro.cli(add, args=arguments, config=(tyro.conf.PositionalRequiredArgs, tyro.conf.FlagCreatePairsOff))
     except (DiffLCSError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

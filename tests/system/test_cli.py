@@ -36,6 +36,18 @@ def run(capsys, *arguments) -> tuple[int, str, str]:
     return code, captured.out, captured.err
 
 
+def passes(capsys, *arguments) -> str:
+    code, out, err = run(capsys, *arguments)
+    assert code == 0, err
+    return out
+
+
+def fails(capsys, *arguments) -> str:
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    return err
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _small_pictures(registries):
     """Films of a sixteenth of the pixels, which software draws."""
@@ -84,8 +96,7 @@ def test_help(capsys, command, monkeypatch):
 
 
 def test_every_command_has_a_test_of_its_help(capsys):
-    code, _, err = run(capsys, "nonsense")
-    assert code == 2
+    err = fails(capsys, "nonsense")
     assert all(command in err for command in HELP)
 
 
@@ -199,8 +210,7 @@ def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
 
 def test_a_model_in_single_precision_is_refused_before_anything_is_written(capsys, tmp_path):
     LCSModel(9, 6, 3, dtype=torch.float32).save_pretrained(tmp_path / "model")
-    code, _, err = run(capsys, "train", "--smoke", "--init", tmp_path / "model", "--out", tmp_path / "run")
-    assert code == 2
+    err = fails(capsys, "train", "--smoke", "--init", tmp_path / "model", "--out", tmp_path / "run")
     assert "init: expected a model with n_x=9, n_u=6, float64, as task cube needs, got n_x=9, n_u=6, float32" in err
     assert not (tmp_path / "run").exists()
 
@@ -265,21 +275,16 @@ def test_a_long_evaluation_shows_lines_without_a_terminal(capsys, monkeypatch):
 def test_a_missing_package_names_the_line_that_installs_it(capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tyro" else find(name, *a))
-    code, _, err = run(capsys, "evaluate", "nowhere")
-    assert code == 2
-    assert 'pip install "difflcs[rl,envs,viz]"' in err
+    assert 'pip install "difflcs[rl,envs,viz]"' in fails(capsys, "evaluate", "nowhere")
 
 
 def test_evaluate(capsys, finished):
-    code, out, _ = run(capsys, "evaluate", finished, "--goals", 3, "--seed", 5, "--json")
-    assert code == 0
+    out = passes(capsys, "evaluate", finished, "--goals", 3, "--seed", 5, "--json")
     record = json.loads(out)
     assert (record["goals"], record["seed"], record["solver_failures"]) == (3, 5, 0)
     assert 0 <= record["ci_low"] <= record["success_rate"] <= record["ci_high"] <= 1
     assert record["versions"]["mujoco"]
-    code, out, _ = run(capsys, "evaluate", finished, "--smoke", "--action-support")
-    assert code == 0
-    assert "of 4 goals (95 % interval" in out
+    assert "of 4 goals (95 % interval" in passes(capsys, "evaluate", finished, "--smoke", "--action-support")
 
 
 def test_a_run_says_which_object_it_was_trained_on(capsys, tmp_path, monkeypatch):
@@ -298,47 +303,36 @@ def test_a_run_says_which_object_it_was_trained_on(capsys, tmp_path, monkeypatch
     config = json.loads((path / "config.json").read_text())
     (tmp_path / "other/config.json").write_text(json.dumps({**config, "object": {**stored, "source": "ycb_mesh"}}))
     shutil.rmtree(tmp_path / "other/model")
-    code, _, err = run(capsys, "train", "--out", tmp_path / "other", "--resume")
-    assert (code, "expected the environment it was started with" in err) == (2, True)
+    err = fails(capsys, "train", "--out", tmp_path / "other", "--resume")
+    assert "expected the environment it was started with" in err
     monkeypatch.setenv("DIFFLCS_YCB_DIR", str(tmp_path))
-    code, _, err = run(capsys, "evaluate", path, "--smoke")
-    assert code == 2
-    assert "025_mug.stl" in err
+    assert "025_mug.stl" in fails(capsys, "evaluate", path, "--smoke")
 
 
 def test_assets_download(capsys, tmp_path, monkeypatch):
     from difflcs_envs import AssetError, assets
 
-    code, _, err = run(capsys, "assets", "download", "teapot")
-    assert code == 2
-    assert "sugar_box" in err
+    assert "sugar_box" in fails(capsys, "assets", "download", "teapot")
     calls = []
     monkeypatch.setattr(assets, "download", lambda names, folder, report: calls.append((names, folder)))
     assert run(capsys, "assets", "download")[0] == 0
-    code, out, _ = run(capsys, "assets", "download", "mug", "clamp", "--folder", tmp_path)
-    assert code == 0
-    assert f"DIFFLCS_YCB_DIR={tmp_path}" in out
+    assert f"DIFFLCS_YCB_DIR={tmp_path}" in passes(capsys, "assets", "download", "mug", "clamp", "--folder", tmp_path)
     assert calls == [(None, None), (("mug", "clamp"), tmp_path)]
 
     def fail(*_, **__):
         raise AssetError("no network")
 
     monkeypatch.setattr(assets, "download", fail)
-    code, _, err = run(capsys, "assets", "download")
-    assert (code, err) == (2, "difflcs: no network\n")
+    assert fails(capsys, "assets", "download") == "difflcs: no network\n"
 
 
 def test_an_existing_run_is_not_overwritten(capsys, finished):
     before = contents(finished)
-    code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", finished)
-    assert code == 2
-    assert "--resume" in err
-    code, _, err = run(capsys, "train", "--smoke", "--out", finished, "--resume", "--seed", 3)
-    assert code == 2
-    assert "--seed: expected 0" in err
+    assert "--resume" in fails(capsys, "train", "--method", "violation", "--smoke", "--out", finished)
+    assert "--seed: expected 0" in fails(capsys, "train", "--smoke", "--out", finished, "--resume", "--seed", 3)
     for words in (["--minutes", 6], ["--minutes=6.0"], ["--final_goals", 300]):  # defaults, and not what the run has
-        code, _, err = run(capsys, "train", "--out", finished, "--resume", *words)
-        assert (code, f"{str(words[0]).partition('=')[0].replace('_', '-')}: expected " in err) == (2, True)
+        err = fails(capsys, "train", "--out", finished, "--resume", *words)
+        assert f"{str(words[0]).partition('=')[0].replace('_', '-')}: expected " in err
     assert run(capsys, "train", "--out", finished, "--resume", "--seed", 0)[0] == 0
     assert run(capsys, "train", "--out", finished, "--resume")[0] == 0  # nothing left to do
     assert contents(finished) == before
@@ -357,8 +351,7 @@ def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monke
         (["--init", path / "model"], "outside the run"),
         (["--resume"], "force: expected without resume"),
     ):
-        code, _, err = run(capsys, "train", *short, *arguments)
-        assert (code, message in err) == (2, True), err
+        assert message in fails(capsys, "train", *short, *arguments)
         assert contents(path) == before
     with monkeypatch.context() as patch:  # interrupted before it begins
         patch.setattr("difflcs.rl.methods.ViolationMethod.trainer", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -378,9 +371,7 @@ def test_force_never_replaces_what_is_not_a_run(capsys, tmp_path, content):
     if content is not None:
         (path / "config.json").write_text(content)
     before = contents(path)
-    code, _, err = run(capsys, "train", "--smoke", "--out", path, "--force")
-    assert code == 2
-    assert "--force replaces runs only" in err
+    assert "--force replaces runs only" in fails(capsys, "train", "--smoke", "--out", path, "--force")
     assert contents(path) == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["thesis"]
     file = tmp_path / "file"
@@ -396,9 +387,7 @@ def test_the_default_run_directory_says_what_is_in_it():
 
 
 def test_bench(capsys):
-    code, out, _ = run(capsys, "bench", "--smoke")
-    assert code == 0
-    assert "forward + backward" in out
+    assert "forward + backward" in passes(capsys, "bench", "--smoke")
     record = json.loads(run(capsys, "bench", "--smoke", "--json")[1])
     for timing in record["timings"]:
         assert timing["ratio"] == pytest.approx(timing["ipopt"] / timing["batched"])
@@ -418,8 +407,7 @@ def test_an_interrupted_training_says_how_to_go_on(capsys, finished, tmp_path, m
         code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err
-    code, out, _ = run(capsys, "evaluate", path, "--smoke")
-    assert code == 0
+    out = passes(capsys, "evaluate", path, "--smoke")
     assert "not finished" in out
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
     model = "model/model.safetensors"
@@ -436,12 +424,8 @@ def test_render(capsys, finished, tmp_path):
     assert video.stat().st_size > 3_000
     assert [path.name for path in video.parent.iterdir()] == ["video.mp4"]
     before = video.read_bytes()
-    code, _, err = run(capsys, "render", finished, "--out", video)
-    assert code == 2
-    assert "--force" in err
-    code, _, err = run(capsys, "render", finished, "--goal", 0.4, 0.03, 0.3, "--out", video, "--force")
-    assert code == 2
-    assert "expected [-0.06" in err
+    assert "--force" in fails(capsys, "render", finished, "--out", video)
+    assert "expected [-0.06" in fails(capsys, "render", finished, "--goal", 0.4, 0.03, 0.3, "--out", video, "--force")
     assert video.read_bytes() == before
     assert run(capsys, "render", "zoo:trifinger-cube", "--smoke", "--out", video, "--force")[0] == 0
     assert video.read_bytes() != before
@@ -459,8 +443,7 @@ def test_pictures_of_a_model(capsys, tmp_path, finished):
 
 def test_demo(capsys, tmp_path):
     for attempt in range(2):  # the second continues, that is, only draws again
-        code, out, _ = run(capsys, "demo", "--smoke", "--out", tmp_path / "demo")
-        assert code == 0
+        out = passes(capsys, "demo", "--smoke", "--out", tmp_path / "demo")
         assert ("continuing it" in out) == (attempt == 1)
         assert "success before learning: " in out
         assert "success after 0.5 minutes of data: " in out
@@ -505,8 +488,7 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
 @pytest.mark.parametrize("words", ["train --out", "plot cube --out", "render cube --out", "evaluate cube --plot"])
 def test_a_place_that_cannot_be_written_is_reported_first(capsys, tmp_path, words):
     (tmp_path / "file").touch()
-    code, _, err = run(capsys, *words.split(), tmp_path / "file/video.mp4")
-    assert code == 2
+    err = fails(capsys, *words.split(), tmp_path / "file/video.mp4")
     assert err.startswith("difflcs: ")  # and nothing of ffmpeg or of the work before it
     assert re.search("expected a (place to write|folder) .* choose another", err)
 
@@ -523,8 +505,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(_storage, "write_atomically", full)
-        code, _, err = run(capsys, "train", "--smoke", "--method", "violation", "--out", path)
-    assert code == 2
+        err = fails(capsys, "train", "--smoke", "--method", "violation", "--out", path)
     assert "No space left" in err
     assert "--resume" in err
     assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}

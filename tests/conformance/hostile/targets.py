@@ -386,14 +386,8 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
             draw = torch.from_numpy(np.asarray(rng.standard_normal(v.shape)))
             seeds.append(draw / size.reshape(-1, *[1] * (v.ndim - 1)))
         torch.autograd.backward([*values, plan.objective], seeds)
-        terms = np.concatenate(
-            [
-                (leaf.grad.numpy() * direction(k)).reshape(count, -1)
-                for k, leaf in leaves.items()
-                if leaf.grad is not None
-            ],
-            1,
-        )
+        gradients = {k: leaf.grad.numpy() for k, leaf in leaves.items() if leaf.grad is not None}
+        terms = np.concatenate([(g * direction(k)).reshape(count, -1) for k, g in gradients.items()], 1)
         guess = Primal(*(v.detach() for v in values))
         solved = (plan.status == Status.CONVERGED).numpy()
         found = (_numpy(v) for v in (*values, plan.objective))
@@ -481,11 +475,8 @@ def _loss_differences(problem: Loss, rng: Generator) -> tuple[np.ndarray, int]:
     loss = violation_loss(model, *tensors, gamma=problem.gamma, xi=problem.xi, reduction="none")
     weight = 1 / loss.detach().clamp_min(1e-300).numpy()
     (loss * torch.from_numpy(weight)).sum().backward()
-    terms = [
-        (p.grad.numpy() * draws[k] * problem.system[k]).ravel()
-        for k, p in model.named_parameters()
-        if p.grad is not None
-    ]
+    gradients = {k: p.grad.numpy() for k, p in model.named_parameters() if p.grad is not None}
+    terms = [(g * draws[k] * problem.system[k]).ravel() for k, g in gradients.items()]
     for name, leaf in zip(data, tensors, strict=True):
         assert leaf.grad is not None
         terms.append((leaf.grad.numpy() * data[name] * getattr(problem, name)).ravel())
