@@ -201,8 +201,6 @@ T* at(nb::handle address) {
 }
 
 Lane make_lane(const nb::dict& functions, const nb::dict& fields, const nb::dict& constants) {
-  const auto number = [&](const char* name) { return nb::cast<double>(constants[name]); };
-  const auto integer = [&](const char* name) { return nb::cast<int>(constants[name]); };
   Lane lane{};
   lane.step1 = reinterpret_cast<StepFunction>(nb::cast<std::uintptr_t>(functions["mj_step1"]));
   lane.step2 = reinterpret_cast<StepFunction>(nb::cast<std::uintptr_t>(functions["mj_step2"]));
@@ -210,27 +208,21 @@ Lane make_lane(const nb::dict& functions, const nb::dict& fields, const nb::dict
   lane.get_state = reinterpret_cast<GetStateFunction>(nb::cast<std::uintptr_t>(functions["mj_getState"]));
   lane.model = at<const void>(fields["model"]);
   lane.data = at<void>(fields["data"]);
-  lane.axes = at<const double>(fields["axes"]);
-  lane.anchors = at<const double>(fields["anchors"]);
-  lane.tips = at<const double>(fields["tips"]);
-  lane.velocities = at<const double>(fields["velocities"]);
-  lane.bias = at<const double>(fields["bias"]);
-  lane.mass = at<const double>(fields["mass"]);
+  for (auto [name, into] : {std::pair{"axes", &lane.axes}, {"anchors", &lane.anchors}, {"tips", &lane.tips},
+                            {"velocities", &lane.velocities}, {"bias", &lane.bias}, {"mass", &lane.mass},
+                            {"object_position", &lane.object_position}, {"object_quaternion", &lane.object_quaternion}})
+    *into = at<const double>(fields[name]);
   lane.control = at<double>(fields["control"]);
-  lane.object_position = at<const double>(fields["object_position"]);
-  lane.object_quaternion = at<const double>(fields["object_quaternion"]);
   lane.saved = at<double>(fields["saved"]);
   for (nb::handle address : nb::cast<nb::list>(fields["warnings"])) lane.warnings.push_back(at<std::int32_t>(address));
-  lane.kp = number("kp");
-  lane.kd = number("kd");
-  lane.singular_determinant = number("singular_determinant");
-  lane.singular_damping = number("singular_damping");
-  lane.tip_height = number("tip_height");
-  lane.timestep = number("timestep");
-  lane.workspace_radius = number("workspace_radius");
-  lane.substeps = integer("substeps");
-  lane.time_signature = integer("time_signature");
-  lane.save_signature = integer("save_signature");
+  for (auto [name, into] : {std::pair{"kp", &lane.kp}, {"kd", &lane.kd}, {"tip_height", &lane.tip_height},
+                            {"singular_determinant", &lane.singular_determinant},
+                            {"singular_damping", &lane.singular_damping}, {"timestep", &lane.timestep},
+                            {"workspace_radius", &lane.workspace_radius}})
+    *into = nb::cast<double>(constants[name]);
+  for (auto [name, into] : {std::pair{"substeps", &lane.substeps}, {"time_signature", &lane.time_signature},
+                            {"save_signature", &lane.save_signature}})
+    *into = nb::cast<int>(constants[name]);
   return lane;
 }
 

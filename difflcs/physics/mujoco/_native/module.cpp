@@ -131,11 +131,8 @@ Motion make_motion(const nb::dict& f) {
   m.simulated = at<const void*>(f, "simulated");
   m.linearised = at<const void*>(f, "linearised");
   m.advance = at<Act>(f, "advance");
-  m.nq = value<int>(f, "nq");
-  m.nv = value<int>(f, "nv");
-  m.nu = value<int>(f, "nu");
-  m.na = value<int>(f, "na");
-  m.steps = value<int>(f, "steps");
+  for (auto [name, into] : {std::pair{"nq", &m.nq}, {"nv", &m.nv}, {"nu", &m.nu}, {"na", &m.na}, {"steps", &m.steps}})
+    *into = value<int>(f, name);
   for (auto [name, into] :
        {std::pair{"gain", &m.gain}, {"constant", &m.constant}, {"bias", &m.bias}, {"low", &m.low}, {"high", &m.high}})
     *into = value<std::vector<double>>(f, name);
@@ -305,19 +302,12 @@ NB_MODULE(_mujoco, m) {
   // What a cache holds when Python ends is no leak.
   nb::set_leak_warnings(false);
   nb::class_<Library>(m, "Library", "Functions of MuJoCo.")
-      .def(
-          "__init__",
-          [](Library* self, const nb::dict& addresses, int kinds, int stride) {
-            new (self) Library(make_library(addresses, kinds, stride));
-          },
-          "addresses"_a, "kinds"_a, "stride"_a);
-  nb::class_<Scene>(m, "Scene", "Geoms that may touch.")
-      .def("__init__", [](Scene* self, const nb::dict& fields) { new (self) Scene(make_scene(fields)); }, "fields"_a);
+      .def(nb::new_(&make_library), "addresses"_a, "kinds"_a, "stride"_a);
+  nb::class_<Scene>(m, "Scene", "Geoms that may touch.").def(nb::new_(&make_scene), "fields"_a);
   nb::class_<Place>(m, "Place", "A model and its data, by addresses. They must outlive it.")
-      .def("__init__", [](Place* self, const nb::dict& fields) { new (self) Place(make_place(fields)); }, "fields"_a);
+      .def(nb::new_(&make_place), "fields"_a);
   nb::class_<Motion>(m, "Motion", "Models that are simulated and linearised, by addresses. They must outlive it.")
-      .def(
-          "__init__", [](Motion* self, const nb::dict& fields) { new (self) Motion(make_motion(fields)); }, "fields"_a);
+      .def(nb::new_(&make_motion), "fields"_a);
   m.def("find_contacts", &find_contacts, "library"_a, "scene"_a, "places"_a, "qpos"_a, "within"_a, "gap"_a, "normal"_a,
         "tangent"_a, "friction"_a, "geom"_a, "near"_a,
         "Contacts of many states. Returns where MuJoCo said an error or warned.");
