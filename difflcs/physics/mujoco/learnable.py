@@ -208,7 +208,8 @@ class LearnableMujocoLCS(nn.Module):
     def slopes_along(self, weights: Sequence[Tensor], x: Tensor, context: Tensor | None = None) -> Tensor:
         """Compute the slopes (m, ..., n) of m weighted sums of the matrices by each parameter, at each state.
 
-        `weights` has those of each matrix, (m, ...) and its size, in the order of `LCSParams`; x and context as in `params`.
+        `weights` has those of each matrix, (m, ...) and its size, in the order of `LCSParams`; the rest is as in
+        `params`.
         """
         given = (self.change, x) if context is None else (self.change, x, context)
         matrices = _Matrices(self, x.dtype, len(given))
