@@ -55,7 +55,8 @@ def test_there_are_ten_in_order():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_runs(path: Path, tmp_path: Path):
+def test_runs(path: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.delenv("VIRTUAL_ENV", raising=False)  # IPython warns where another one is active
     place = tmp_path / path.parent.name  # beside `examples`, as in a checkout
     place.mkdir()
     (tmp_path / "examples").symlink_to(FOLDER.parent / "examples")
