@@ -116,10 +116,7 @@ def correct(
     known = np.isfinite(change).all(1, keepdims=True)
     change = np.where(known, change, 0.0)
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
-    tree = step.motion.of_tree
-    mass = (tree[:, None] == np.arange(len(step.motion.trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[
-        :, :, None
-    ]
+    mass = step.motion.in_tree / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
 
     def size(moved: NDArray[Any]) -> Array:
         """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
@@ -151,7 +148,7 @@ def correct(
     grow = energy.sum(-1)
     due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15)) * grow / total
     part = energy / np.where(forces != 0, forces, 1.0)[:, None] / np.maximum(grow, 1e-20)[:, :, None]
-    both = np.concatenate([tree, tree])
+    both = np.tile(step.motion.of_tree, 2)
     by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
     C[:, : 2 * nv] += by_forces
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
@@ -160,24 +157,26 @@ def correct(
     return LCSParams.of_checked({"C": C, "d": d}, like=system), doubtful
 
 
-def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:
+def warn_of_wrong(
+    predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, in_tree: NDArray[Any], model: Any
+) -> None:
     """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
     Each tree of bodies counts by itself, as an object may be much lighter than the robot.
 
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
-    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
+    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv), and in_tree
+    (nv, n_trees) says which degree of freedom belongs to which tree.
     """
     mass = np.linalg.inv(inverse_mass)
-    trees = model.dof_treeid == np.unique(model.dof_treeid)[:, None]
 
     def size(moved: Array) -> Array:
         """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
         energy = moved * (mass @ moved[..., None])[..., 0]
-        return np.sqrt(np.maximum(energy @ trees.T, 0.0))
+        return np.sqrt(np.maximum(energy @ in_tree, 0.0))
 
     off, alone = predicted - after, np.nan_to_num(size(free - before), nan=np.inf).min(0)
-    least, change = _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ trees.T), size(after - before)
+    least, change = _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree), size(after - before)
     alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
     moves = size(before) + alone
     most = change + _FARTHER * moves + least
@@ -187,7 +186,7 @@ def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, in
     if wrong.any():
         *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)
         moved = off[tuple(worst)]
-        dof = int(np.argmax(np.abs(moved * (mass[worst[1]] @ moved)) * trees[tree]))
+        dof = int(np.argmax(np.abs(moved * (mass[worst[1]] @ moved)) * in_tree[:, tree]))
         joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
         warn(
             f"expected a system as near to MuJoCo's own step as standing still is, that moves where MuJoCo does, also "

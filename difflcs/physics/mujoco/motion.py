@@ -151,6 +151,7 @@ class Dynamic:
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
         self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
+        self.in_tree = self.tree[:, None] == self.trees  # (nv, n_trees)
         self.firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
