@@ -74,7 +74,7 @@ class Options:
     seed: int = 0
     """Seed of motions and controls."""
     times: bool = False
-    """Times alone, with another place for the JSON."""
+    """Times alone; their JSON lies beside that of the errors."""
     out: Path = Path("benchmarks/results/physics_models.json")
     """Where the JSON goes."""
 
@@ -245,6 +245,8 @@ def clock(model: Any, o: Options) -> dict[str, Any] | None:
 def main(o: Options) -> None:
     """Measure, print, write."""
     torch.set_num_threads(1)
+    if o.times:
+        o.out = o.out.with_stem(f"{o.out.stem}-times")
     results: dict[str, dict[str, Any]] = {}
     for package, paths in find(o.packages).items():
         for path in paths:
