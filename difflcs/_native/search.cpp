@@ -492,7 +492,7 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     solve([&](int64_t j) { return !solved(out.status[tried.owner[j]]) && !promises(j); });
   for (int64_t e = 0; e < count; e++) {
     // Out of time after its starts were compared: one that was solved by chance need not be the best.
-    const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < out.objective[e];
+    const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < needed(out.objective[e]);
     if (out.status[e] != kUnreached && !(runner.stopped() && behind)) continue;
     if (best[e] >= 0) {
       copy_plan(n, tried.plans(), best[e], out, e);
