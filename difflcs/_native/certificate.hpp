@@ -181,8 +181,9 @@ struct Certificate {
   }
 
   // Checks at most kLanes elements by their stored numbers; a solved one whose residual is too large becomes
-  // numerical, and one with a weakly active constraint degenerate.
-  void judge(const MpcSolve& o, const int64_t* elements, int count) {
+  // numerical, and one with a weakly active constraint degenerate. One that was cut off, by time or the number of its
+  // iterations, is solved if its residual says so; `flat`: which of these have a flat direction.
+  void judge(const MpcSolve& o, const int64_t* elements, int count, const bool* flat = nullptr) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = elements[l < count ? l : 0];
@@ -216,6 +217,8 @@ struct Certificate {
       o.residual[e] = residual;
       o.fragile[e] = fragile[l] != 0;
       if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
+      if (flat && o.status[e] == int8_t(Status::max_iter) && residual <= o.certified)
+        o.status[e] = int8_t(flat[l] ? Status::degenerate : Status::converged);
       if (weak[l] && o.status[e] == int8_t(Status::converged)) o.status[e] = int8_t(Status::degenerate);
     }
   }

@@ -152,7 +152,8 @@ class Solver {
 
   // Out of time: stores every plan as it is executed at the problem's relaxation, along the last feedback law where
   // there is one, since the actions alone can lead an unstable plant elsewhere.
-  void leave_off(const MpcSolve& o, Mask idle) {
+  // `weak`: the lanes whose last sweep met a flat direction.
+  void leave_off(const MpcSolve& o, Mask idle, Mask weak) {
     const Watch never{[](void*) { return false; }, nullptr};
     Mask fresh;
     for (int l = 0; l < kLanes; l++) fresh[l] = progress.lane[l].iterations == 0 ? -1 : 0;
@@ -166,7 +167,7 @@ class Solver {
     }
     progress.J = problem.cost(at);
     for (int l = 0; l < kLanes; l++)
-      if (!idle[l]) progress.store(o, l, Status::max_iter, problem.multiplier);
+      if (!idle[l]) progress.store(o, l, Status::max_iter, weak[l] && !fresh[l], problem.multiplier);
   }
 };
 
@@ -178,6 +179,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   progress.needs_rollout = progress.stale_cost = progress.released = progress.gauss_newton = Mask{};
   progress.waiting = 0;
   int live = 0;
+  Mask weak = Mask{};
   for (int l = 0; l < kLanes; l++) {
     if (progress.take(o, counter, l))
       live++;
@@ -193,7 +195,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
       progress.J = select(progress.needs_rollout, rolled, progress.J);
     }
     if (watch.stop(watch.context)) {
-      leave_off(o, idle);
+      leave_off(o, idle, weak);
       break;
     }
     if (any(progress.stale_cost)) progress.J = select(progress.stale_cost, problem.cost(at), progress.J);
@@ -206,6 +208,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
         riccati.sweep(at, {}, {progress.regularisation, keep_curvature, progress.gauss_newton, progress.released});
     const Mask frozen = progress.finish(o, sweep, riccati.force, counter, idle, live);
     if (live == 0) break;
+    weak = sweep.weak;
     Vec step, gain;
     const Mask moved = search(frozen, step, gain, watch);
     progress.advance(o, sweep, frozen, moved, step, gain);
@@ -214,7 +217,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     if (progress.exact(o, sweep, step) && !progress.take(o, counter, 0)) live--;
     progress.leave(o, counter, frozen | first, live);
   }
-  if (progress.waiting) progress.certificate.judge(o, progress.finished, progress.waiting);
+  if (progress.waiting) progress.certify(o);
 }
 
 }  // namespace

@@ -81,8 +81,9 @@ struct Progress {
   Mask released;       // without contact yet
   Mask gauss_newton;   // by Gauss-Newton
   Mask stale_cost;     // J is that of earlier multipliers
-  // Elements that are finished but not certified yet.
+  // Elements that are finished but not certified yet, and whether some direction at their plan is flat.
   int64_t finished[kLanes];
+  bool flat[kLanes];
   int waiting;
 
   Progress(const MpcBatch& b, ProblemData<T>& problem) : batch(b), n(b), problem(problem), certificate(b) {}
@@ -167,13 +168,15 @@ struct Progress {
       o.fragile[e] = 0;
     }
   }
-  void store(const MpcSolve& o, int l, Status status, const Multipliers& multipliers) {
+  void store(const MpcSolve& o, int l, Status status, bool weak, const Multipliers& multipliers) {
     write(o, l, status, multipliers);
+    flat[waiting] = weak;
     finished[waiting++] = lane[l].element;
-    if (waiting == kLanes) {
-      certificate.judge(o, finished, waiting);
-      waiting = 0;
-    }
+    if (waiting == kLanes) certify(o);
+  }
+  void certify(const MpcSolve& o) {
+    certificate.judge(o, finished, waiting, flat);
+    waiting = 0;
   }
 
   // Stores a plan as solved if the certificate confirms it.
@@ -289,7 +292,7 @@ struct Progress {
               : infeasible                 ? Status::infeasible
               : a.iterations >= o.max_iter ? Status::max_iter
                                            : Status::numerical,
-              force);
+              sweep.weak[l], force);
       if (!take(o, counter, l)) live--;
     }
     return frozen;

@@ -262,18 +262,18 @@ def test_plans_of_many_contacts_get_more_starts():
 
 
 def test_what_was_given_up_is_solved_where_all_else_fails():
-    """With few iterations: 22 of 192 are not solved, and 31 where no start gets a second chance."""
+    """With few iterations: 27 of 192 are not solved, and 57 where no start gets a second chance."""
     lcs = LCSModel(9, 6, 8, init_scale=0.3, generator=torch.Generator().manual_seed(2)).params().detach()
     eye = torch.eye(9, dtype=torch.float64)
     cost = QuadraticCost(eye, 0.1 * eye[:6, :6], eye)
     x0 = torch.randn(64, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     failed = 0
-    for max_iter in (27, 30, 32):
+    for max_iter in (24, 27, 30):
         backend = BatchedBackend(restarts=4, max_iter=max_iter)
         mpc = LCSMPCLayer(lcs, cost, 30, -1.0, 1.0, backend=backend, on_failure="mask")
         with pytest.warns(SolveWarning):
             failed += int((~mpc(x0).converged).sum())
-    assert failed <= 26
+    assert failed <= 40
 
 
 # --- large problems ---------------------------------------------------------------------------------------------------
