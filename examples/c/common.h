@@ -7,10 +7,17 @@
 
 enum { LONGEST_LINE = 1 << 16 };
 
-/* Reads all rows of `columns` numbers. Returns how many there are, or -1. */
+/* Whether a line is one of names: its first entry is no number. */
+static int has_names(const char* line) {
+  char* end;
+  strtod(line, &end);
+  return end == line || strchr(",; \t\r\n", *end) == NULL;
+}
+
+/* Reads all rows of `columns` numbers, after a line of names if there is one. Returns how many there are, or -1. */
 static long read_rows(const char* path, size_t columns, double** rows) {
   static char line[LONGEST_LINE];
-  long count = 0;
+  long count = 0, names = 0;
   size_t room = 0;
   FILE* file = fopen(path, "r");
   *rows = NULL;
@@ -20,32 +27,35 @@ static long read_rows(const char* path, size_t columns, double** rows) {
   }
   while (fgets(line, sizeof line, file)) {
     char* at = line;
-    if (count > 0 && line[strspn(line, " \t\r\n")] == '\0') continue; /* an empty line, as at the end */
-    if (count++ == 0) continue;                                       /* the names */
-    if ((size_t)count > room) {
+    if (line[strspn(line, " \t\r\n")] == '\0') continue; /* an empty line, as at the end */
+    if (count + names == 0 && has_names(line)) {
+      names = 1;
+      continue;
+    }
+    if ((size_t)++count > room) {
       double* larger = realloc(*rows, (room = 2 * (size_t)count) * columns * sizeof(double));
       if (!larger) break;
       *rows = larger;
     }
     for (size_t i = 0; i < columns; i++) {
       char* end;
-      (*rows)[(size_t)(count - 2) * columns + i] = strtod(at, &end);
+      (*rows)[(size_t)(count - 1) * columns + i] = strtod(at, &end);
       if (end == at) {
-        fprintf(stderr, "%s: expected %zu numbers in row %ld, got %zu\n", path, columns, count - 1, i);
+        fprintf(stderr, "%s: expected %zu numbers in row %ld, got %zu\n", path, columns, count, i);
         fclose(file);
         return -1;
       }
       at = end + (*end == ',');
     }
     if (at[strspn(at, " \t\r\n")] != '\0') {
-      fprintf(stderr, "%s: expected %zu numbers in row %ld, got more\n", path, columns, count - 1);
+      fprintf(stderr, "%s: expected %zu numbers in row %ld, got more\n", path, columns, count);
       fclose(file);
       return -1;
     }
   }
   fclose(file);
-  if (count < 2) fprintf(stderr, "%s: expected a line of names, and rows of %zu numbers\n", path, columns);
-  return count - 1;
+  if (count < 1) fprintf(stderr, "%s: expected rows of %zu numbers\n", path, columns);
+  return count;
 }
 
 static int ascending(const void* a, const void* b) {

@@ -3,8 +3,8 @@
  *     python examples/push_t.py --export DIR
  *     push_t DIR observations.csv [--bench PASSES]
  *
- * The observations are a CSV file with one line of names; a row has the number of its episode, x and y of the disc
- * [px], and x, y [px] and angle [rad] of the T. Where the number changes an episode begins. What is printed is a CSV
+ * The observations are a CSV file, with or without a line of names; a row has the number of its episode, x and y of the
+ * disc [px], and x, y [px] and angle [rad] of the T. Where the number changes an episode begins. What is printed is a CSV
  * file again: what is done in each step, the place from which it pushes next where it travels, and the action, the
  * target of the disc [px]. With --bench, the steps of so many passes over the rows are timed instead.
  *

@@ -2,8 +2,8 @@
  *
  *     robot controller.difflcs trajectory.csv [--time-limit SECONDS] [--bench STEPS]
  *
- * The trajectory is a CSV file with one line of names; each row has the n_x numbers of a state and the n_goal numbers
- * of the goal. What is printed is a CSV file again: the status of each step, and its action with all digits. With
+ * The trajectory is a CSV file, with or without a line of names; each row has the n_x numbers of a state and the n_goal
+ * numbers of the goal. What is printed is a CSV file again: the status of each step, and its action with all digits. With
  * --bench, so many steps over the rows of the trajectory, again and again, are timed instead. On a robot the states
  * come from its sensors and the actions go to its motors; the rest stays as it is here. */
 #define _POSIX_C_SOURCE 199309L

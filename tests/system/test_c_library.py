@@ -123,6 +123,9 @@ def test_the_example_closes_the_loop_bit_equal_to_python(exported, robot):
     assert statuses[30] == "NUMERICAL"
     assert statuses.count("CONVERGED") + statuses.count("DEGENERATE") >= 58
     assert len({row[1:] for row in ours}) > 50  # the robot moves
+    bare = exported / "bare.csv"  # without the line of names
+    bare.write_text(files[1].read_text().partition("\n")[2])
+    assert [*csv.reader(call(robot, files[0], bare).splitlines())][1:] == rows
 
 
 @pytest.mark.slow
