@@ -75,6 +75,25 @@ class PredictiveModule(nn.Module):
             states.append(self(states[-1], u_seq[..., t, :]).x_next)
         return torch.stack(states, dim=-2)
 
+    def _constants(self) -> dict[str, object]:
+        """Return the numbers that make the system together with the parameters; a `state_dict` remembers them."""
+        return {}
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if hasattr(destination, "_metadata"):  # torch's place for what is no tensor, such as versions
+            destination._metadata[prefix[:-1]]["constants"] = self._constants()
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, local_metadata: Any, *others: Any) -> None:
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *others)
+        own, saved, errors = self._constants(), local_metadata.get("constants", {}), others[-1]
+        errors += [
+            f"{prefix}{name}: expected {own[name]} like this {type(self).__name__}, got {saved[name]} of the one that "
+            f"was saved; build it with the same, or load dict(state), which has parameters alone"
+            for name in own
+            if saved.get(name, own[name]) != own[name]
+        ]
+
     def check_inputs(self, **tensors: Tensor) -> None:
         """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""
         check_inputs(self.n_x, self.n_u, next(self.parameters()), tensors, owner="model")
@@ -160,6 +179,9 @@ class LCSModel(PredictiveModule):
     def extra_repr(self) -> str:
         """Return the text that print(model) shows."""
         return f"n_x={self.n_x}, n_u={self.n_u}, n_lam={self.n_lam}, stiffness={self.stiffness:g}"
+
+    def _constants(self) -> dict[str, object]:
+        return {"stiffness": self.stiffness}
 
     @property
     @runs_eagerly

@@ -179,6 +179,9 @@ class ScaledLCS(PredictiveModule):
         inner = system_at(self.lcs, None if x is None else self.scales.states(x), context)
         return self.scales.params(inner)
 
+    def _constants(self) -> dict[str, object]:
+        return {f"scales.{name}": getattr(self.scales, name).tolist() for name in ("center", "state", "action")}
+
     def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
         """Write the `LCSModel` within and its scales into a directory, as `LCSModel.save_pretrained` does.
 

@@ -84,6 +84,19 @@ def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_
     refuse(DTypeError, "lcs: expected LCSModel", ScaledLCS(scaled, scaled.scales).save_pretrained, tmp_path / "other")
 
 
+def test_a_state_dict_of_another_system_with_the_same_parameters_is_refused(data):
+    of = [suggest_scales(*data), suggest_scales(*(2 * value + 1 for value in data))]
+    saved, other, stiff = (
+        ScaledLCS(LCSModel(4, 2, 3, f), scales) for f, scales in ((0.1, of[0]), (0.1, of[1]), (0.2, of[0]))
+    )
+    saved.load_state_dict(saved.state_dict())
+    with pytest.raises(RuntimeError, match=r"scales\.state: expected .* like this ScaledLCS, got .*; build it with"):
+        other.load_state_dict(saved.state_dict())
+    with pytest.raises(RuntimeError, match=r"lcs\.stiffness: expected 0.2 like this LCSModel, got 0.1 of"):
+        stiff.load_state_dict(saved.state_dict())
+    stiff.load_state_dict(dict(saved.state_dict()))
+
+
 def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
     scales, seen = suggest_scales(*data), []
 
