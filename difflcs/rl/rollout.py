@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import describe
-from difflcs.errors import DegenerateWarning, InvalidInputError, NonFiniteError, SolveWarning
+from difflcs.constraints import StageBounds
+from difflcs.errors import DegenerateWarning, DTypeError, InvalidInputError, NonFiniteError, SolveWarning
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -23,20 +25,6 @@ TRANSITIONS = ("state", "action", "goal")
 """Keys of the episodes that are kept to learn from, besides `CONTEXT` if the environment has one."""
 CONTEXT = "context"
 """Key of the quantities that the system depends on besides its state, constant in an episode: a mass, a gain."""
-
-
-class Solution(Protocol):
-    """The part of an `MPCSolution` that a rollout uses."""
-
-    @property
-    def action(self) -> Tensor:
-        """(B, n_u) first actions."""
-        ...
-
-    @property
-    def converged(self) -> Tensor:
-        """(B,) bool."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -53,14 +41,25 @@ class PolicyOutput:
 
 
 class Policy(Protocol):
-    """Maps states (B, n_x), goals (B, n_goal) and optional bounds (n_u,) to a solution, as an `LCSMPCLayer` does.
+    """Maps states (B, n_x), goals (B, n_goal) and optional bounds (n_u,) to plans, as an `LCSMPCLayer` does.
 
-    A context (B, n_context), if the environment has one, is passed by the keyword `context`.
+    A context (B, n_context), if the environment has one, is passed by the keyword `context`. A function or module that
+    takes no bounds is a policy, too; and so is one that returns actions (B, n_u).
     """
 
-    def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None, u_max: Tensor | None) -> Solution:
-        """Solve a batch."""
+    def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None, u_max: Tensor | None) -> Any:
+        """Return something with an `action` (B, n_u) and `converged` (B,) bool, or actions."""
         ...
+
+
+def _takes_bounds(policy: Any) -> bool:
+    """Return whether a policy takes bounds; raise unless it can be called with states and goals."""
+    try:
+        taken = inspect.signature(getattr(policy, "forward", policy))
+        taken.bind_partial(None, None)
+    except TypeError as error:
+        raise DTypeError(f"policy: expected a function of states and goals, got {describe(policy)}: {error}") from error
+    return any(p.name == "u_min" or p.kind is p.VAR_KEYWORD for p in taken.parameters.values())
 
 
 Act = Callable[..., tuple[np.ndarray, np.ndarray]]
@@ -71,12 +70,19 @@ A context (B, n_context), if the environment has one, is the third argument.
 
 
 def action_bounds(env: VectorEnv, policy: object = None) -> tuple[Tensor, Tensor]:
-    """Return the bounds (n_u,) of the action space, float64, within those (n_u,) of a policy that has its own."""
+    """Return the bounds (n_u,) of the action space, float64, within those of a policy that has its own.
+
+    Of bounds by stage those of the first are meant, as its action is executed; of one for each element the widest.
+    """
     space: Any = env.single_action_space
     low, high = (torch.from_numpy(np.asarray(bound, np.float64)) for bound in (space.low, space.high))
+    staged = getattr(policy, "bounds", None)
     own: list[Any] = [getattr(policy, name, None) for name in ("u_min", "u_max")]
-    if all(isinstance(bound, Tensor) and bound.shape == low.shape for bound in own):
-        low, high = (torch.clamp(bound.detach().double().cpu(), low, high) for bound in own)
+    if isinstance(staged, StageBounds):
+        own = [bound[..., 0, :] for bound in staged.by_steps()]
+    if all(isinstance(bound, Tensor) and bound.shape[-1:] == low.shape for bound in own):
+        least, most = (bound.detach().double().cpu().reshape(-1, len(low)) for bound in own)
+        low, high = least.amin(0).clamp(low, high), most.amax(0).clamp(low, high)
     return low, high
 
 
@@ -110,15 +116,28 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
 
     For one call of `collect`: a planner that has memory or draws noise has a method `begin(seed)`, called here.
     """
-    begin = getattr(policy, "begin", None)
+    actor: Any = policy
+    if hasattr(actor, "learned"):  # a Gaussian around the actions of this one
+        actor = actor.controller
+    begin = getattr(actor, "begin", None)
     if begin is not None:
         begin(seed)
+    bounds: Any = {"u_min": u_min, "u_max": u_max} if _takes_bounds(actor) else {}
+    if not bounds and not (u_min is u_max is None):
+        raise InvalidInputError("u_min, u_max: expected none with a policy that takes none, got some; clip its actions")
 
     def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
-        keywords: Any = {} if context is None else {CONTEXT: context}
+        keywords: Any = bounds if context is None else {**bounds, CONTEXT: context}
         with torch.no_grad(), ignore_solver_warnings():
-            solution = policy(state, goal, u_min=u_min, u_max=u_max, **keywords)
-        return solution.action.numpy(), (~solution.converged).numpy()
+            found = actor(state, goal, **keywords)
+        if hasattr(found, "converged"):
+            return found.action.numpy(), (~found.converged).numpy()
+        if not isinstance(found, Tensor) or found.shape[:-1] != state.shape[:1]:
+            wanted = f"plans or actions ({len(state)}, n_u)"
+            raise DTypeError(
+                f"policy: expected it to return {wanted}, got {describe(found)}; return one for each state"
+            )
+        return found.double().numpy(), np.zeros(len(state), bool)
 
     return act
 
@@ -210,7 +229,9 @@ def collect(
         ended: np.ndarray = np.asarray(terminated, bool)[:n] | np.asarray(truncated, bool)[:n]
         if bool(((ended != (t + 1 == episode_steps)) & stable).any()):
             length = f"one of {t + 1}" if t + 1 < episode_steps else "a longer one"
-            raise InvalidInputError(f"episode_steps: expected episodes of {episode_steps} steps, got {length}")
+            raise InvalidInputError(
+                f"episode_steps: expected episodes of {episode_steps} steps, got {length}; pass their number"
+            )
         if context is not None and (np.asarray(observation[CONTEXT])[:n] != context)[stable].any():
             raise InvalidInputError(
                 f"env: expected the same context in a whole episode, got another in step {t + 1}; what changes belongs "

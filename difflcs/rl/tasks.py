@@ -5,6 +5,7 @@ without arguments that registers them: docs/own_system.md makes one.
 """
 
 import functools
+import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,15 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from difflcs._checks import check_kind, check_number, check_positive_int, check_tensor, did_you_mean, make_plain
+from difflcs._checks import (
+    check_kind,
+    check_number,
+    check_positive_int,
+    check_tensor,
+    describe,
+    did_you_mean,
+    make_plain,
+)
 from difflcs._optional import require
 from difflcs.cost import CostModule, GoalCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
@@ -48,9 +57,17 @@ def count_features(features: Features, *sizes: Sequence[int]) -> int:
     """Count what features return, for a state, a goal, an elapsed fraction and perhaps a context of these sizes.
 
     Raises:
-        DTypeError, ShapeError: they return no tensor (..., n).
+        DTypeError, ShapeError: they take other arguments, or return no tensor (..., n).
     """
-    of_two = features(*(torch.zeros(2, *size, dtype=torch.float64) for size in sizes))
+    seen = [torch.zeros(2, *size, dtype=torch.float64) for size in sizes]
+    try:
+        inspect.signature(features).bind(*seen)
+    except TypeError as error:
+        wanted = ", ".join(("state", "goal", "elapsed", "context")[: len(sizes)])
+        raise DTypeError(
+            f"features: expected a function ({wanted}) → (..., n), got {describe(features)}: {error}"
+        ) from error
+    of_two = features(*seen)
     found = check_tensor("features", of_two, finite=False)
     if found.shape[:-1] != (2,):
         raise ShapeError(f"features: expected (2, n) of two states, got {tuple(found.shape)}; return (..., n)")

@@ -1,20 +1,22 @@
 """Success rates and their intervals, on a small contact system that needs no simulator."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
 
-from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import collect, mpc_actions
+from difflcs import StageBounds
+from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.rl.rollout import action_bounds, collect, mpc_actions
 from difflcs.rl.runs.evaluate import evaluate, wilson_interval
 from difflcs.rl.runs.training import TrainConfig, train
 from difflcs.rl.seeding import Stream, episode_seeds
 from difflcs.rl.tasks import Quantity
 from tests.conformance.toy import make_task
 from tests.conftest import refuse
-from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
+from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs
 
 
 def test_wilson_interval_equals_scipy():
@@ -43,6 +45,36 @@ def test_evaluation_bounds():
     bound = torch.tensor([0.01], dtype=torch.float64)
     evaluate(make_envs(2), policy, 2, 0, STEPS, -bound, bound)
     assert policy.bounds[0] == (-bound, bound)
+
+
+def test_a_policy_may_take_states_and_goals_alone_and_return_actions():
+    def toward(x0, goal):
+        return (goal - x0[:, 1:]).clamp(-U_MAX, U_MAX)
+
+    found, expected = (evaluate(make_envs(2), policy, 4, 0, STEPS) for policy in (toward, Reach()))
+    assert replace(found, solver_failures=0) == replace(expected, solver_failures=0)
+    bound = torch.tensor([0.01], dtype=torch.float64)
+    refuse(InvalidInputError, "u_max: expected none", evaluate, make_envs(2), toward, 2, 0, STEPS, -bound, bound)
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (7, "policy: expected a function of states and goals, got int 7"),
+        (lambda x0: x0, "policy: expected a function of states and goals, got function"),
+        (lambda x0, goal: goal[:, 0], r"policy: expected it to return plans or actions \(2, n_u\), got \(2,\)"),
+    ],
+)
+def test_what_is_no_policy_is_refused(policy, message):
+    refuse(DTypeError, message, evaluate, make_envs(2), policy, 2, 0, STEPS)
+    refuse(DTypeError, "config: expected TrainConfig", train, {"task": "cube"})
+
+
+def test_bounds_of_a_policy_by_stage_and_by_element_narrow_the_action_space():
+    env, most = make_envs(2), torch.tensor([[0.03], [0.06]], dtype=torch.float64)
+    staged = SimpleNamespace(bounds=StageBounds(-most, most), u_min=-torch.ones(1), u_max=torch.ones(1))
+    for policy, bound in ((staged, 0.03), (SimpleNamespace(u_min=-most, u_max=most), 0.06)):
+        assert torch.cat(action_bounds(env, policy)).tolist() == [-bound, bound]
 
 
 def test_broken_episodes_count_as_failures():

@@ -150,6 +150,10 @@ def test_bad_values_are_refused(change, error, message):
     ("change", "message"),
     [
         ({"features": lambda state, *_: state[..., 0]}, r"features: expected \(2, n\) of .*got \(2,\); return"),
+        (
+            {"features": lambda state, goal: state},
+            r"features: expected a function \(state, goal, elapsed\) → .*got function",
+        ),
         ({"make_cost": lambda: GoalCost.reach(3, 1, goal_weight=(1.0,))}, r"with a state of shape \(3,\), as the cost"),
         ({"make_cost": lambda: GoalCost.reach(2, 1)}, r"with a goal of shape \(2,\), as the cost"),
     ],

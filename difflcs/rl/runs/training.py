@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from gymnasium.vector import VectorEnv
 
+from difflcs._checks import check_kind
 from difflcs._optional import require, versions
 from difflcs._storage import check_path, short, write_json
 from difflcs.errors import CheckpointError, InvalidInputError
@@ -170,6 +171,7 @@ def train(
         InUseError: another process trains in `out`.
         MissingDependencyError: TensorBoard is not installed.
     """
+    check_kind("config", config, (TrainConfig, type(None)), "make one, or name the task, train(task=...)")
     spec = get_task(task or (TrainConfig() if config is None else config).task)
     config = TrainConfig(task=spec.name) if config is None else config
     if spec.name != config.task:
