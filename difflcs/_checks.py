@@ -135,7 +135,8 @@ def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> Non
     """Check the trailing dimensions of a tensor, as a part of `check_tensor`."""
     if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        turned = len(dims) == 2 and value.ndim > 1 and value.shape[-2] != dims[0][1] == value.shape[-1]
+        unlike = len(dims) == 2 and dims[0][0] != dims[1][0]  # no square matrix
+        turned = unlike and value.ndim > 1 and value.shape[-2] != dims[0][1] == value.shape[-1]
         how = "transpose it" if turned else "reshape it, or rebuild it"
         raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; {how}")
 
@@ -267,15 +268,11 @@ def batch_index(shape: Sequence[int], flat: int) -> str:
 
 def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
     """Refuse tensors on different devices, naming the first two that differ."""
-    first: tuple[str, Tensor] | None = None
-    for name, tensor in tensors:
-        if first is None:
-            first = (name, tensor)
-        elif tensor.device != first[1].device:
-            raise DeviceError(
-                f"{name}: expected it on {first[1].device} like {first[0]}, got {tensor.device}; "
-                f"move one of them with .to(device)"
-            )
+    (first, like), *others = tensors
+    for name, tensor in others:
+        if tensor.device != like.device:
+            where = f"on {like.device} like {first}, got {tensor.device}"
+            raise DeviceError(f"{name}: expected it {where}; move one of them with .to(device)")
 
 
 def plain(value: object) -> object:
@@ -363,6 +360,15 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in choices:
         raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r:.200}")
     return value
+
+
+def check_same_dtype(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors of another dtype than the first of them."""
+    (first, like), *others = tensors.items()
+    for name, value in others:
+        if value.dtype != like.dtype:
+            how = f"convert it with {name}.to({like.dtype})"
+            raise DTypeError(f"{name}: expected {like.dtype} like {first}, got {describe(value)}; {how}")
 
 
 def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_shape, describe, plain, takes_arrays
-from difflcs._differentiation import is_wrapped
+from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages, register
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError
 
@@ -65,6 +65,7 @@ class StageBounds(TensorFields):
     u_min: Tensor
     u_max: Tensor
 
+    @runs_eagerly
     @takes_arrays
     def __init__(
         self,
@@ -105,6 +106,7 @@ class _Constraints(TensorFields):
     E: Tensor | None
     weight: Tensor | None
 
+    @runs_eagerly
     def _fill(self, G: Tensor, g: Tensor, E: Tensor | None, weight: Tensor | float | None) -> None:
         each = "pass one row per constraint"
         check_shape("G", G, "... n_c n_x", remedy=each)

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import (
+    broadcast_batch,
     check_array,
     check_kind,
     check_number,
     check_positive_int,
     check_same_device,
+    check_same_dtype,
     check_shape,
     check_tensor,
     describe,
@@ -44,6 +46,7 @@ class _Quadratic(TensorFields):
     S: Tensor | None
     constant_stage: Tensor | None
 
+    @runs_eagerly
     def _fill(self, Q: Tensor, R: Tensor, Q_final: Tensor, check: bool, **others: Tensor | None) -> None:
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
@@ -71,23 +74,19 @@ class _Quadratic(TensorFields):
             check_stages({k: (fields[k], _DIMENSIONS[k], 0) for k in _STAGES if k in self.by_stage})
         if check:
             for name in ("Q_final",) if "S" in fields else ("Q", "R", "Q_final"):
-                _check_convex(name, fields[name])
+                check_convex(name, fields[name])
             if "S" in fields:
-                _check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
+                check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
         for name in _DIMENSIONS:
             register(self, name, fields.get(name))
 
     def _stage_hessian(self, fields: dict[str, Tensor]) -> Tensor:
         blocks = []
-        for name in ("Q", "S", "R"):
+        for name in "QSR":
             value = fields[name].detach()
             staged = not self.by_stage or name in self.by_stage
             blocks.append(value if staged else value.unsqueeze(-3))
-        try:
-            batch = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
-        except ValueError:
-            shapes = ", ".join(f"{name} {tuple(fields[name].shape)}" for name in ("Q", "S", "R"))
-            raise ShapeError(f"S: expected batch dimensions that fit those of Q and R, got {shapes}") from None
+        batch = broadcast_batch((name, block.shape[:-2]) for name, block in zip("QSR", blocks, strict=True))
         Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)
         return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
@@ -244,7 +243,8 @@ def cost_at(
     return check_kind("cost", value, (QuadraticCost, CostSequence), remedy)
 
 
-def _check_convex(name: str, matrix: Tensor) -> None:
+def check_convex(name: str, matrix: Tensor) -> None:
+    """Refuse weights (..., n, n) whose symmetric part has a negative eigenvalue, where their numbers can be read."""
     if is_wrapped(matrix) or not matrix.numel():
         return
     symmetric = 0.5 * (matrix + matrix.mT).detach().double().cpu()
@@ -257,7 +257,7 @@ def _check_convex(name: str, matrix: Tensor) -> None:
     if bool((eigenvalues[..., 0] < -1e-9 * eigenvalues.abs().amax(-1)).any()):
         raise InvalidInputError(
             f"{name}: expected a positive semi-definite matrix, got smallest eigenvalue "
-            f"{float(eigenvalues[..., 0].min()):.3e}; a negative weight makes the cost unbounded"
+            f"{float(eigenvalues[..., 0].min()):.3e}; a negative weight makes the cost unbounded: learn w.exp() or L Lᵀ"
         )
 
 
@@ -275,6 +275,10 @@ class GoalCost(TensorFields):
         goal_to_q_final: (n_x, n_goal).
         goal_stage: (n_goal, n_goal) constant of one stage, ½ goalᵀ goal_stage goal; zero if None.
         goal_final: (n_goal, n_goal) constant of the final cost; zero if None.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others, or has another dtype.
+        InvalidInputError: Q, R or Q_final has a negative eigenvalue.
     """
 
     Q: Tensor
@@ -285,6 +289,7 @@ class GoalCost(TensorFields):
     goal_stage: Tensor
     goal_final: Tensor
 
+    @runs_eagerly
     @takes_arrays
     def __init__(
         self,
@@ -315,6 +320,7 @@ class GoalCost(TensorFields):
         for name, rows in (("goal_to_q_final", x), ("goal_stage", goal), ("goal_final", goal)):
             check_tensor(name, fields[name], [rows, goal])
         check_same_device(fields.items())
+        check_same_dtype(fields)
         for name, value in fields.items():
             register(self, name, value)
 

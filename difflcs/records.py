@@ -17,6 +17,7 @@ from difflcs._checks import (
     check_kind,
     check_positive_definite,
     check_same_device,
+    check_same_dtype,
     check_shape,
     check_tensor,
     describe,
@@ -131,12 +132,7 @@ class _Record(SystemMatrices):
         for name, dims in SYSTEM.items():
             check_dims(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)])
         check_same_device(tensors.items())
-        for name, value in tensors.items():
-            if value.dtype != self.A.dtype:
-                raise DTypeError(
-                    f"{name}: expected {self.A.dtype} like A, got {describe(value)}; "
-                    f"convert it with {name}.to({self.A.dtype})"
-                )
+        check_same_dtype(tensors)
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
         vars(self)["_checked"] = _numbers_of(self.F)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from difflcs._checks import (
     broadcast_batch,
@@ -22,7 +22,7 @@ from difflcs._checks import (
 from difflcs._differentiation import is_wrapped
 from difflcs._fields import check_not_nan
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound, check_bounds
-from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost, cost_at
+from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost, check_convex, cost_at
 from difflcs.errors import BoundsError, DTypeError, ShapeError
 from difflcs.mpc.backends.base import Backend
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
@@ -422,6 +422,8 @@ class Inputs:
                 value = value.unsqueeze(0)
             if name in SYMMETRIC and not torch.equal(value, value.mT):
                 value = 0.5 * (value + value.mT)
+            if name in SYMMETRIC and isinstance(tensor, nn.Parameter):  # an optimiser may have changed it
+                check_convex(name, value)
             if name in MAY_BE_INFINITE:
                 if unseen or tensor.requires_grad:
                     check_not_nan(name, value)

@@ -117,11 +117,9 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     For one call of `collect`: a planner that has memory or draws noise has a method `begin(seed)`, called here.
     """
     actor: Any = policy
-    if hasattr(actor, "learned"):  # a Gaussian around the actions of this one
-        actor = actor.controller
-    begin = getattr(actor, "begin", None)
-    if begin is not None:
-        begin(seed)
+    actor = actor.controller if hasattr(actor, "learned") else actor  # the mean of a Gaussian
+    if hasattr(actor, "begin"):
+        actor.begin(seed)
     bounds: Any = {"u_min": u_min, "u_max": u_max} if _takes_bounds(actor) else {}
     if not bounds and not (u_min is u_max is None):
         raise InvalidInputError("u_min, u_max: expected none with a policy that takes none, got some; clip its actions")

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs import CostSequence, QuadraticCost
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs import CostSequence, GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.systems import pushing_cost
 from tests.conformance import judges
 from tests.conftest import refuse
@@ -77,6 +77,17 @@ def test_a_weight_with_a_negative_eigenvalue_is_refused(build, name):
         InvalidInputError, match=f"{name}: expected a positive semi-definite.*{re.escape(f'{smallest:.3e}')}"
     ):
         QuadraticCost(**tensors)
+    learned = {**build.cost_tensors(0), name: nn.Parameter(build.cost_tensors(0)[name])}
+    mpc = LCSMPCLayer(build.params(), QuadraticCost(**learned), 3, -1.0, 1.0)
+    with torch.no_grad():
+        learned[name].copy_(tensors[name])  # as an optimiser does
+    refuse(InvalidInputError, f"{name}: expected a positive semi-definite", mpc, torch.zeros(4).double())
+
+
+def test_a_goal_cost_has_one_dtype():
+    cost = pushing_cost()
+    fields = cost.Q, cost.R.float(), cost.Q_final, *cost.maps().values()
+    refuse(DTypeError, "R: expected torch.float64 like Q", GoalCost, *fields)
 
 
 def test_semidefinite_weights_are_accepted():

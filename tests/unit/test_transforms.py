@@ -5,7 +5,17 @@ import torch
 from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
-from difflcs import LCSMPCLayer, LCSParams, LCSSequence, MPCSolution, Status, prediction_loss, solve_lcp, violation_loss
+from difflcs import (
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    MPCSolution,
+    QuadraticCost,
+    Status,
+    prediction_loss,
+    solve_lcp,
+    violation_loss,
+)
 from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
 from tests.conftest import refuse
 
@@ -285,6 +295,7 @@ def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, 
             2 * violation_loss(params, 2 * x, u, x_next, "auto"),
             2 * prediction_loss(model, 2 * x, u, x_next),
             (2 * layer(torch.sin(0.2 * x)).action).square(),
+            layer(0.2 * x, cost=QuadraticCost(**build.cost_tensors(0))).action.square(),
         )
 
     torch.compiler.reset()

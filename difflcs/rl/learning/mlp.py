@@ -98,9 +98,7 @@ class MLPController(nn.Module):
         self._step += 1
         action = self.mean(x0, goal, elapsed, context)
         low, high = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
-        return PolicyOutput(
-            torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool)
-        )
+        return PolicyOutput(action.clamp(low, high), torch.ones(x0.shape[:-1], dtype=torch.bool))
 
     def config(self) -> dict[str, Any]:
         """Return the sizes of the network."""
