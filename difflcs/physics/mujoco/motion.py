@@ -148,6 +148,7 @@ class Dynamic:
         damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
+        self._disabled, self._described = int(model.opt.disableflags), {}
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
         self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
@@ -156,13 +157,14 @@ class Dynamic:
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
-        self._native = {steps: self.describe(steps, self.flags) for steps in (self.simulated, self.finer)}
 
-    @cached_property
-    def _loose(self) -> dict[Steps, _mujoco.Motion]:
-        """Steps without constraints: implicit, as stiff drives that nothing holds may overshoot else."""
-        integrator = _DISCRETE if self.steps.integrator == _DISCRETE else _IMPLICIT
-        return {steps: self.describe(Steps(steps.count, integrator), flags("CONSTRAINT")) for steps in self._native}
+    def _native(self, steps: Steps, loose: bool = False) -> _mujoco.Motion:
+        """Describe steps once; `loose`: without constraints, implicit, as stiff drives that nothing holds overshoot."""
+        if (steps, loose) not in self._described:
+            integrator = _DISCRETE if self.steps.integrator == _DISCRETE else _IMPLICIT
+            kind = (Steps(steps.count, integrator), flags("CONSTRAINT")) if loose else (steps, self.flags)
+            self._described[steps, loose] = self.describe(*kind)
+        return self._described[steps, loose]
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
@@ -202,7 +204,7 @@ class Dynamic:
             for end in ends:
                 other = ctrl[some]
                 other[:, i] += end
-                taken, steps = (places, states[some], other), self._native[self.simulated]
+                taken, steps = (places, states[some], other), self._native(self.simulated)
                 after = self.simulate(*taken, read.unstable[some]) if i in curved else self.run(steps, *taken)
                 with np.errstate(over="ignore", invalid="ignore"):
                     secants[some, :, i] += (after - read.reached[some]) * (end / (ends**2).sum(0))[:, None]
@@ -216,12 +218,11 @@ class Dynamic:
         What becomes fast is simulated in finer steps as well, as drives may be stiffer with another action. Where it is
         `loose`, there are no equality constraints either.
         """
-        described = self._loose if loose else self._native
         after = np.full((len(states), 2 * self.model.nv + self.model.na), np.inf)
         for steps, some in ((self.simulated, ~unstable), (self.finer, None)):
             some = ~(np.abs(after).max(1) < _FAST_MOTION) if some is None else some
             if some.any():
-                after[some] = self.run(described[steps], places, states[some], ctrl[some])
+                after[some] = self.run(self._native(steps, loose), places, states[some], ctrl[some])
         return after
 
     def run(self, described: _mujoco.Motion, places: Places, states: Array, ctrl: Array) -> Array:
@@ -236,7 +237,7 @@ class Dynamic:
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
-        places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
+        places.check(_mujoco.read_motion(library(), self._native(steps), places.take(n), states, ctrl, *arrays), n)
         return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
@@ -269,26 +270,28 @@ class Dynamic:
             steps: of the simulation.
             disabled: flags of what it leaves out.
         """
-        model, actuators = self.model, self.actuators
-        simulated, linearised = copy.copy(model), copy.copy(model)
-        self._models += simulated, linearised
-        simulated.opt.disableflags |= disabled
-        simulated.opt.timestep = self.seconds / steps.count
-        simulated.opt.integrator = steps.integrator
-        if steps.integrator == _DISCRETE:  # whose acceleration is that of the whole step
-            simulated.opt.disableflags |= flags("EULERDAMP")
-        # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        for any_step in (simulated, linearised):  # equality constraints are as soft as in the model's own steps
-            softened = (any_step.eq_solref[:, 0] > 0) & (not model.opt.disableflags & flags("REFSAFE"))
-            any_step.eq_solref[softened, 0] = np.maximum(any_step.eq_solref[softened, 0], 2 * model.opt.timestep)
-        linearised.opt.disableflags |= self.flags | flags("EULERDAMP", "REFSAFE")
-        linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
-        linearised.opt.solver, linearised.opt.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-15
-        actuators.unlimit_rates(linearised)
+        simulated = self._copy(disabled | flags("EULERDAMP") * (steps.integrator == _DISCRETE))
+        simulated.opt.timestep, simulated.opt.integrator = self.seconds / steps.count, steps.integrator
         advance = _ADVANCE.get(steps.integrator)
-        return actuators.describe(
-            simulated, self.relative, linearised, steps.count, addresses()[advance] if advance else 0
-        )
+        address = addresses()[advance] if advance else 0
+        return self.actuators.describe(simulated, self.relative, self._linearised, steps.count, address)
+
+    def _copy(self, disabled: int) -> Any:
+        """A copy of the model as it was at first; equality constraints are as soft as in the model's own steps."""
+        self._models.append(model := copy.copy(self.model))
+        model.opt.disableflags = self._disabled | disabled
+        softened = (model.eq_solref[:, 0] > 0) & (not self._disabled & flags("REFSAFE"))
+        model.eq_solref[softened, 0] = np.maximum(model.eq_solref[softened, 0], 2 * model.opt.timestep)
+        return model
+
+    @cached_property
+    def _linearised(self) -> Any:
+        """The model with a time step of one second and no implicit part: the next velocity is ν + acceleration."""
+        model = self._copy(self.flags | flags("EULERDAMP", "REFSAFE"))
+        model.opt.timestep, model.opt.integrator = 1.0, _EULER
+        model.opt.solver, model.opt.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-15
+        self.actuators.unlimit_rates(model)
+        return model
 
     def finish(self, read: Linearised, x: Array, equality: Any = None) -> DynamicStep:
         """Return the motion at states x (n, n_x), with soft equality constraints, `EqualityRows`."""

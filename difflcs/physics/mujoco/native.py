@@ -62,6 +62,7 @@ def in_turn(method: Method) -> Method:
     return cast(Method, alone)
 
 
+@functools.cache
 def flags(*names: str) -> int:
     """Return the bits of `disableflags` with these names, such as CONTACT."""
     return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
