@@ -175,9 +175,9 @@ def warn_of_wrong(
         energy = moved * (mass @ moved[..., None])[..., 0]
         return np.sqrt(np.maximum(energy @ in_tree, 0.0))
 
-    off, alone = predicted - after, np.nan_to_num(size(free - before), nan=np.inf).min(0)
-    least, change = _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree), size(after - before)
-    alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0)
+    off, least = predicted - after, _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree)
+    change, alone = size(after - before), np.nan_to_num(size(free - before))
+    alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0).min(0)
     moves = size(before) + alone
     most = change + _FARTHER * moves + least
     held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)

@@ -384,7 +384,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
     states = np.tile(read.states[some], (m, 1))
     after = of._whole.simulate(of._places, states, ctrl)
-    unstable, ways = np.tile(read.moved.unstable[some], m), (True, False) if of._model.neq else (True,)
+    unstable, ways = np.tile(read.moved.unstable[some], m), (True, False) if of._motion.loosens else (True,)
     free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()

@@ -157,12 +157,12 @@ class Dynamic:
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
+        self.loosens = model.neq > 0 or self.steps.integrator == _DISCRETE  # without constraints it moves otherwise
 
     def _native(self, steps: Steps, loose: bool = False) -> _mujoco.Motion:
         """Describe steps once; `loose`: without constraints, implicit, as stiff drives that nothing holds overshoot."""
         if (steps, loose) not in self._described:
-            integrator = _DISCRETE if self.steps.integrator == _DISCRETE else _IMPLICIT
-            kind = (Steps(steps.count, integrator), flags("CONSTRAINT")) if loose else (steps, self.flags)
+            kind = (Steps(steps.count, _IMPLICIT), flags("CONSTRAINT")) if loose else (steps, self.flags)
             self._described[steps, loose] = self.describe(*kind)
         return self._described[steps, loose]
 
