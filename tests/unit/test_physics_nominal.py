@@ -85,6 +85,7 @@ def test_what_friction_holds_stays_as_in_mujoco_by_the_right_force(name, option)
             torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=2e-2, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore:expected a system as near")  # also where the grip would open without a control
 def test_a_grip_that_the_nominal_control_does_not_close_holds_from_step_to_step():
     model = load(PINCH, SERVOS, "")
     data = mujoco.MjData(model)

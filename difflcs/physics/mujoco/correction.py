@@ -22,7 +22,7 @@ from difflcs._checks import broadcast_batch, check_shape, check_tensor
 from difflcs.errors import ContactWarning, InvalidInputError, warn
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import Rows
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
 from difflcs.physics.mujoco.native import flags
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, advance
@@ -36,6 +36,8 @@ _NEVER = 1e4  # times what moves: motion without constraints that grows beyond a
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
 _HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
+_FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_TURNS = 0.5  # [rad] of joints in a step, by which they turn farther without constraints
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -50,6 +52,9 @@ class WholeStep:
     def __init__(self, motion: Dynamic, limits: bool):
         self.model, self._motion = motion.model, motion
         self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
+        of, dofs = self.model.dof_jntid, np.arange(self.model.nv)
+        goes = (self.model.jnt_type[of] == _FREE) & (dofs < self.model.jnt_dofadr[of] + 3)
+        self._turns = ~goes & (self.model.jnt_type[of] != _SLIDE)
 
     def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
         """Return ζ, ν and the change of activation (n, 2 nv + na) after a step; NaN where MuJoCo warns or raises.
@@ -63,6 +68,25 @@ class WholeStep:
             return self._motion.run(self._native, places, states, ctrl)
         except InvalidInputError:  # the systems stand without a correction
             return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
+
+    def hold(self, read: Linearised, places: Places, states: Array, x: Array) -> Array:
+        """Linearise half way of the whole step, where joints turn much farther without constraints.
+
+        Returns what `simulate` does at the nominal controls that were read; x (n, n_x) are the states of the system.
+        """
+        motion, nv = self._motion, self.model.nv
+        ctrl = read.nominal + x[:, :nv] @ motion.moment.T
+        after = self.simulate(places, states, ctrl)
+        held = (np.abs(read.reached - after)[:, :nv][:, self._turns] > _TURNS).any(1)
+        if held.any():
+            again = motion.read_by(self._native, places, states[held], ctrl[held])
+            again.unstable[:] = motion.find_unstable(again)
+            for name in ("middle", "acceleration", "A", "B", "unstable"):
+                getattr(read, name)[held] = getattr(again, name)
+            read.reached[held] = np.nan  # without constraints it leads elsewhere
+            straight = np.setdiff1d(np.arange(read.secant.shape[2]), motion.actuators.curved)
+            read.secant[np.ix_(held, np.arange(read.secant.shape[1]), straight)] = np.inf
+        return after
 
     def follow(self, places: Places, state: MujocoState, control: Any, x: Tensor, u: Tensor) -> Tensor | None:
         """Follow states (..., H, n_x) from x (..., n_x), one before each of actions u (..., H, n_u).

@@ -34,7 +34,7 @@ from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
-_TRIED = 8  # states at which actions are tried, of the first that a module is asked for
+_TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
 _BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
@@ -157,7 +157,7 @@ class MujocoLCS:
         self.length, self._recovery = length, Recovery(model, length)
         budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None and torsion
-        self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
+        self._whole, self._asked = WholeStep(self._motion, limits != 0) if plain else None, 0
         self._parts = torch.from_numpy(np.random.default_rng(0).random((_BETWEEN, 1, model.nu)))
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more = distance, length, budgets, friction, torsion, pushed
@@ -267,12 +267,10 @@ class MujocoLCS:
         system = LCSParams.of_fitting(matrices)
         system = self._caps.limit_by_forces(system, read, response) if step is None else system
         system = self._servos.limit(system, free, step, read, self.length, self._give)
-        if step is not None and overlaps is not None and self._whole is not None and self.n_lam:
-            idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
-            after = self._whole.simulate(self._places, read.states, idle)
+        if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = rows.bound / unit, found, hard, len(self._servos.those)
-            system, read.doubtful[:] = correct(system, step, after, read.tangent, *more)
+            more = read.tangent, rows.bound / unit, found, hard, len(self._servos.those)
+            system, read.doubtful[:] = correct(system, step, read.after, *more)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
@@ -335,10 +333,12 @@ class MujocoLCS:
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._caps.order(self._finder.find(qpos))
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        moved = self._motion.read(self._places, states, ctrl)
+        moved, after = self._motion.read(self._places, states, ctrl), None
         if isinstance(self._motion, Dynamic):
             moved = self._motion.find_secants(moved, self._places, states, flat)
-        return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
+            if self._whole is not None and self.n_lam:
+                after = self._whole.hold(moved, self._places, states, flat)
+        return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool), after)
 
 
 def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
@@ -362,10 +362,10 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
-    first, of._tried = not of._tried, True
+    before, of._asked = of._asked, of._asked + len(read.x)
     if step is None or of._whole is None:
         return
-    if of._actuators.curved.size or first:
+    if of._actuators.curved.size or before.bit_length() < of._asked.bit_length():
         read.doubtful[:_TRIED] = True
     some = np.flatnonzero(read.doubtful)
     if not some.size:

@@ -172,15 +172,13 @@ class Dynamic:
         Raises:
             InvalidInputError: MuJoCo raised an error, or has counted a warning.
         """
-        read = self._read(self.simulated, places, states, ctrl)
-        unstable = self._find_unstable(read)
+        read = self.read_by(self._native(self.simulated), places, states, ctrl)
+        unstable = self.find_unstable(read)
         if unstable.any():
-            again = self._read(self.finer, places, states[unstable], ctrl[unstable])
+            again = self.read_by(self._native(self.finer), places, states[unstable], ctrl[unstable])
             for values, better in zip(read, again, strict=True):
                 values[unstable] = better
             read.unstable[:] = unstable
-        activation = states[:, self.model.nq + self.model.nv :] + read.middle[:, 2 * self.model.nv :]
-        self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
     def find_secants(self, read: Linearised, places: Places, states: Array, x: Array) -> Linearised:
@@ -232,15 +230,19 @@ class Dynamic:
         places.check(_mujoco.simulate(library(), described, *taken), len(after))
         return after
 
-    def _read(self, steps: Steps, places: Places, states: Array, ctrl: Array) -> Linearised:
+    def read_by(self, described: _mujoco.Motion, places: Places, states: Array, ctrl: Array) -> Linearised:
+        """Read it by the steps that are `described`, stable or not."""
         n, nv, nu = len(states), self.model.nv, self.model.nu
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
-        places.check(_mujoco.read_motion(library(), self._native(steps), places.take(n), states, ctrl, *arrays), n)
-        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
+        places.check(_mujoco.read_motion(library(), described, places.take(n), states, ctrl, *arrays), n)
+        read = Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
+        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
+        self.actuators.even_out(read.nominal, activation, read.A, read.B)
+        return read
 
-    def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
+    def find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
         nv, h = self.model.nv, self.seconds / self.simulated.count
         if self.simulated.integrator == _DISCRETE:
@@ -272,8 +274,7 @@ class Dynamic:
         """
         simulated = self._copy(disabled | flags("EULERDAMP") * (steps.integrator == _DISCRETE))
         simulated.opt.timestep, simulated.opt.integrator = self.seconds / steps.count, steps.integrator
-        advance = _ADVANCE.get(steps.integrator)
-        address = addresses()[advance] if advance else 0
+        address = addresses().get(_ADVANCE.get(steps.integrator, ""), 0)
         return self.actuators.describe(simulated, self.relative, self._linearised, steps.count, address)
 
     def _copy(self, disabled: int) -> Any:

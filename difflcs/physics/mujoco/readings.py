@@ -24,6 +24,7 @@ class Readings(NamedTuple):
         dof_contacts: contacts.
         moved: buffers of the motion.
         doubtful: (n,) True where actions are to be tried.
+        after: (n, n_x) what MuJoCo's own step does at the nominal action, see `WholeStep`; None: not asked for.
     """
 
     batch: torch.Size
@@ -34,6 +35,7 @@ class Readings(NamedTuple):
     dof_contacts: MujocoContacts
     moved: Any
     doubtful: Any
+    after: Any
 
     def batched(self, value: Any) -> Any:
         """Give an array (n, ...) the batch dimensions."""
