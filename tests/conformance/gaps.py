@@ -274,7 +274,7 @@ def main() -> None:
     parser.add_argument(
         "--fill", type=Path, nargs="?", const=Path("docs/promises.md"), help="page to put the table into"
     )
-    options, text = judge_seeds(parser, judge, table)
+    options, text = judge_seeds(parser, judge, table, Judged)
     if options.fill:
         fill(options.fill, "gaps", text)
 
