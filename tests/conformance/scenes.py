@@ -336,8 +336,8 @@ def table(judged: list[Judged]) -> str:
     """Markdown: what became of scenes, and errors where doing nothing has 1, by the constraints that act in MuJoCo."""
     outcomes = Counter(j.outcome for j in judged)
     off = sum(j.outcome == "warned" and j.off() for j in judged)
-    lines = [f"{len(judged)} scenes: " + ", ".join(f"{n} {name}" for name, n in outcomes.items())]
-    lines[0] += f", of those with a warning {off} wrong for the random action\n"
+    outcomes["warned, wrong for the random action"] = off
+    lines = [f"{len(judged)} scenes: " + ", ".join(f"{n} {name}" for name, n in outcomes.items()), ""]
     lines += ["| act | scenes | median error | silent faults |", "|---|---|---|---|"]
     for kind in sorted({j.kind for j in judged if j.kind}):
         some = [j for j in judged if j.kind == kind]
@@ -357,9 +357,7 @@ def judge_seeds(parser: argparse.ArgumentParser, judge: Any, table: Any, kind: A
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--count", type=int, default=1000, help="number of scenes")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument(
-        "--out", type=Path, default=Path(os.devnull), help="what was judged, a line each: go on from there"
-    )
+    parser.add_argument("--out", type=Path, default=Path(os.devnull), help="keeps what was judged, to go on")
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.count)
     lines = options.out.read_text().splitlines() if options.out.exists() else []
@@ -367,11 +365,10 @@ def judge_seeds(parser: argparse.ArgumentParser, judge: Any, table: Any, kind: A
     missing = [seed for seed in seeds if seed not in known]
     with multiprocessing.get_context("spawn").Pool(options.processes, _prepare) as pool, options.out.open("a") as out:
         for seed, judged in zip(missing, pool.imap(judge, missing, chunksize=20), strict=True):
-            known[seed] = judged
             print(json.dumps([seed, judged]), file=out, flush=True)
-    results = {seed: known[seed] for seed in seeds}
-    text = table([j for j in results.values() if j])
-    print(text, *(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+            known[seed] = judged
+    text = table([known[seed] for seed in seeds if known[seed]])
+    print(text, *(f"seed {s}: {known[s]}" for s in seeds if known[s] and known[s].wrong()), sep="\n")
     return options, text
 
 

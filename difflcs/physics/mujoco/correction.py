@@ -36,8 +36,7 @@ _NEVER = 1e4  # times what moves: motion without constraints that grows beyond a
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
 _HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
-_FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-_TURNS = 0.5  # [rad] of joints in a step, by which they turn farther without constraints
+_APART = 0.5  # [rad, m] in a step, by which joints go farther without constraints
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -52,9 +51,6 @@ class WholeStep:
     def __init__(self, motion: Dynamic, limits: bool):
         self.model, self._motion = motion.model, motion
         self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
-        of, dofs = self.model.dof_jntid, np.arange(self.model.nv)
-        goes = (self.model.jnt_type[of] == _FREE) & (dofs < self.model.jnt_dofadr[of] + 3)
-        self._turns = ~goes & (self.model.jnt_type[of] != _SLIDE)
 
     def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
         """Return ζ, ν and the change of activation (n, 2 nv + na) after a step; NaN where MuJoCo warns or raises.
@@ -70,15 +66,14 @@ class WholeStep:
             return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
 
     def hold(self, read: Linearised, places: Places, states: Array, x: Array) -> Array:
-        """Linearise half way of the whole step, where joints turn much farther without constraints.
+        """Linearise half way of the whole step, where joints go much farther without constraints.
 
         Returns what `simulate` does at the nominal controls that were read; x (n, n_x) are the states of the system.
         """
         motion, nv = self._motion, self.model.nv
         ctrl = read.nominal + x[:, :nv] @ motion.moment.T
         after = self.simulate(places, states, ctrl)
-        held = (np.abs(read.reached - after)[:, :nv][:, self._turns] > _TURNS).any(1)
-        if held.any():
+        if (held := (np.abs(read.reached - after)[:, :nv] > _APART).any(1)).any():
             again = motion.read_by(self._native, places, states[held], ctrl[held])
             again.unstable[:] = motion.find_unstable(again)
             for name in ("middle", "acceleration", "A", "B", "unstable"):
