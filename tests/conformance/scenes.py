@@ -13,7 +13,6 @@ python -m tests.conformance.scenes --first 17 --count 1
 import argparse
 import copy
 import json
-import multiprocessing
 import os
 import warnings
 from collections import Counter
@@ -335,8 +334,7 @@ def judge(seed: int) -> Judged | None:
 def table(judged: list[Judged]) -> str:
     """Markdown: what became of scenes, and errors where doing nothing has 1, by the constraints that act in MuJoCo."""
     outcomes = Counter(j.outcome for j in judged)
-    off = sum(j.outcome == "warned" and j.off() for j in judged)
-    outcomes["warned, wrong for the random action"] = off
+    outcomes["warned, wrong for the random action"] = sum(j.outcome == "warned" and j.off() for j in judged)
     lines = [f"{len(judged)} scenes: " + ", ".join(f"{n} {name}" for name, n in outcomes.items()), ""]
     lines += ["| act | scenes | median error | silent faults |", "|---|---|---|---|"]
     for kind in sorted({j.kind for j in judged if j.kind}):
@@ -346,27 +344,21 @@ def table(judged: list[Judged]) -> str:
     return "\n".join(lines)
 
 
-def _prepare() -> None:
-    """Prepare a process: one thread; MuJoCo does not print that a scene diverges, which its data counts."""
-    torch.set_num_threads(1)
-    mujoco.set_mju_user_warning(lambda message: None)
-
-
 def judge_seeds(parser: argparse.ArgumentParser, judge: Any, table: Any, kind: Any) -> tuple[Any, str]:
     """Judge the scenes that the command line asks for; print and return their table, and print the wrong ones."""
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--count", type=int, default=1000, help="number of scenes")
-    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(os.devnull), help="keeps what was judged, to go on")
     options = parser.parse_args()
+    torch.set_num_threads(1)
+    mujoco.set_mju_user_warning(lambda message: None)  # of what diverges, which the data count
     seeds = range(options.first, options.first + options.count)
     lines = options.out.read_text().splitlines() if options.out.exists() else []
     known = {seed: judged and kind(*judged) for seed, judged in map(json.loads, lines)}
-    missing = [seed for seed in seeds if seed not in known]
-    with multiprocessing.get_context("spawn").Pool(options.processes, _prepare) as pool, options.out.open("a") as out:
-        for seed, judged in zip(missing, pool.imap(judge, missing, chunksize=20), strict=True):
-            print(json.dumps([seed, judged]), file=out, flush=True)
-            known[seed] = judged
+    with options.out.open("a") as out:
+        for seed in (seed for seed in seeds if seed not in known):
+            known[seed] = judge(seed)
+            print(json.dumps([seed, known[seed]]), file=out, flush=True)
     text = table([known[seed] for seed in seeds if known[seed]])
     print(text, *(f"seed {s}: {known[s]}" for s in seeds if known[s] and known[s].wrong()), sep="\n")
     return options, text

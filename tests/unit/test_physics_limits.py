@@ -7,11 +7,7 @@ import torch
 
 from difflcs.errors import ContactWarning
 from difflcs.physics.mujoco import MujocoLCS
-
-
-def load(worldbody, rest=""):
-    text = f'<mujoco><option timestep=".001"/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
-    return mujoco.MjModel.from_xml_string(text)
+from tests.unit.test_physics_mujoco import load
 
 
 def hinge(words=""):

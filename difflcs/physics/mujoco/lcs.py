@@ -346,29 +346,21 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
     moved = of._motion.read(of._places, here, of._ctrl[None])
-    x = np.zeros((1, of.n_x))
-    if not isinstance(of._motion, Dynamic):
-        response = far = of._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0]
-        velocity = 0.0
-    else:
-        response = velocity = of.seconds * of._motion.finish(moved, x).response[0]
-        far = of.seconds * response
+    h = of.seconds if (dynamic := isinstance(of._motion, Dynamic)) else 1.0
+    response = h * of._motion.finish(moved, np.zeros((1, of.n_x)), None).response.reshape(-1, nv, nv)[0]
+    far = h * response
     if limits and of.n_contacts and not of._quasi_static:
         of._servos.choose(far)
-    yields = of._actuators.yields(far, velocity)
-    dimensions = 3 if finder.axis is None else 2
-    return median_apart(model, data, here[0], response, finder.main_pairs, dimensions), yields
+    yields = of._actuators.yields(far, dynamic * response)
+    return median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2), yields
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
     before, of._asked = of._asked, of._asked + len(read.x)
-    if step is None or of._whole is None:
-        return
-    if of._actuators.curved.size or before.bit_length() < of._asked.bit_length():
-        read.doubtful[:_TRIED] = True
-    some = np.flatnonzero(read.doubtful)
-    if not some.size:
+    due = of._actuators.curved.size > 0 or before.bit_length() < of._asked.bit_length()
+    some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
+    if step is None or of._whole is None or not some.size:
         return
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
     zero = of.control(x, torch.zeros_like(idle))
