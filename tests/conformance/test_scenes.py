@@ -1,11 +1,7 @@
 """A few hundred scenes of the campaign of random models."""
 
-from contextlib import nullcontext
-
 import pytest
 
-from difflcs.errors import ContactWarning
-from difflcs.physics.mujoco import MujocoLCS
 from tests.conformance import scenes
 
 
@@ -27,11 +23,3 @@ def test_a_scene_that_was_once_silent_is_not(seed):
     judged = scenes.judge(seed)
     assert judged
     assert not judged.wrong()
-
-
-def test_actions_are_tried_again_when_a_module_was_asked_for_twice_as_many_states():
-    model, data, _ = scenes.random_scene(902514)
-    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
-    for due in (True, True, False, True, False):
-        with pytest.warns(ContactWarning, match="as near") if due else nullcontext():
-            module.params(module.observe(data))

@@ -66,10 +66,7 @@ class WholeStep:
             return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
 
     def hold(self, read: Linearised, places: Places, states: Array, x: Array) -> Array:
-        """Linearise half way of the whole step, where joints go much farther without constraints.
-
-        Returns what `simulate` does at the nominal controls that were read; x (n, n_x) are the states of the system.
-        """
+        """Simulate at the nominal controls; linearise half way there what goes much farther without constraints."""
         motion, nv = self._motion, self.model.nv
         ctrl = read.nominal + x[:, :nv] @ motion.moment.T
         after = self.simulate(places, states, ctrl)

@@ -381,8 +381,8 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
     predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
     at, to, alone = (v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
-    inverse_mass, in_tree = read.moved.inverse_mass[some], of._motion.in_tree
-    warn_of_wrong(at[0], to[0], alone, step.velocity[some], inverse_mass, in_tree, of._model)
+    bodies = read.moved.inverse_mass[some], of._motion.in_tree, of._model
+    warn_of_wrong(at[0], to[0], alone, step.velocity[some], *bodies)
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:
