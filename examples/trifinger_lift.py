@@ -83,8 +83,12 @@ CORNERS = np.array([[[1.0 if bit == "0" else -1.0 for bit in f"{i:03b}"][::-1] f
 # --- fingers ---
 
 
-def inverse(finger: int, tips: Array) -> tuple[Array, Array]:
-    """Joint angles (…, 3) [rad], upper end of the lower link (…, 3) for places of a tip (…, 3) [m], or nan."""
+def inverse(finger: int, tips: Array, offset: float = OFFSETS[1]) -> tuple[Array, Array]:
+    """Joint angles (…, 3) [rad] and a point (…, 3) of the third joint's axis for places of a tip (…, 3) [m], or nan.
+
+    `offset` is how far the point is from the plane in which the first joint's axis lies: by default as far as the tip,
+    where the lower link ends.
+    """
     c, s = np.cos(TURNS[finger]), np.sin(TURNS[finger])
     turn = np.array([[c, -s], [s, c]])
     x, y = np.moveaxis(tips[..., :2] @ turn, -1, 0)
@@ -98,7 +102,7 @@ def inverse(finger: int, tips: Array) -> tuple[Array, Array]:
         second = np.arctan2(out, down) - np.arctan2(lower, LINKS[0] + LINKS[1] * np.cos(third))
     depth = -LINKS[0] * np.cos(second)
     c, s = np.cos(first), np.sin(first)
-    knee = np.stack([OFFSETS[1] * c - depth * s, HIP + LINKS[0] * np.sin(second), OFFSETS[1] * s + depth * c], -1)
+    knee = np.stack([offset * c - depth * s, HIP + LINKS[0] * np.sin(second), offset * s + depth * c], -1)
     knee[..., 2] += HEIGHT
     knee[..., :2] = knee[..., :2] @ turn.T
     return np.stack([-first, second, third], -1), knee
@@ -137,7 +141,16 @@ def static_torques(finger: int, angles: Array, force: Array) -> Array:
 
 
 class Robot:
-    """Kinematics and computed torque of the three fingers, from the package's URDF."""
+    """Kinematics and computed torque of the three fingers, from the package's URDF.
+
+    At the time when a torque begins to act it asks for the acceleration
+
+        a = r̈ + k_p (r − p) + k_d (ṙ − ṗ)
+
+    of each tip, with the gains that put both poles of a double integrator with held input to `pole`. Computed torque
+    gives it, τ = M J⁻¹ a + bias + what the damping of the robot's safety layer takes away + Jᵀ f. The term of dJ/dt is
+    left out.
+    """
 
     damping = np.array([0.08, 0.08, 0.04] * 3)
     """Of the joints, by the robot's safety layer [N m s/rad]."""
@@ -172,6 +185,10 @@ class Robot:
         upper = np.triu(self.pin.crba(self.model, self.data, q))
         return upper + np.triu(upper, 1).T, self.pin.nonLinearEffects(self.model, self.data, q, v)
 
+    def predict(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Joint angles and velocities at the time when the next torque begins to act."""
+        return q + DELAY * v, v
+
     def torque(self, q: Array, v: Array, reference: tuple[Array, Array, Array], force: Array) -> NDArray[np.float32]:
         """Torques (9,) [N m] that lead the tips along a reference (place, velocity, acceleration; (3, 3) each).
 
@@ -181,11 +198,12 @@ class Robot:
             reference: for the time when the torque begins to act.
             force: (3, 3) with which the tips push [N].
         """
-        q = q + DELAY * v
+        q, v = self.predict(q, v)
         places, jacobians = self.tips(q)
         mass, bias = self.dynamics(q, v)
         where, speed, ahead = reference
         a = ahead + self.k_p * (where - places) + self.k_d * (speed - np.einsum("fij,j->fi", jacobians, v))
+        # A far reference asks for more [m/s²] than motors have.
         a *= np.minimum(1, 25.0 / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-9))
         wanted, push = np.zeros(9), np.zeros(9)
         for f in range(3):
@@ -512,6 +530,7 @@ class Follow:
         """Step towards targets (3, 3), to arrive at rest; place and velocity before it, and the acceleration."""
         gap = targets - self.place
         distance = np.linalg.norm(gap, axis=1, keepdims=True)
+        # The fastest from which it can still stop, in steps.
         half = self.acceleration * STEP / 2
         brake = np.sqrt(half**2 + 2 * self.acceleration * distance) - half
         wanted = gap / np.maximum(distance, 1e-9) * np.minimum(np.minimum(speed or self.speed, brake), distance / STEP)

@@ -2,9 +2,14 @@
 
     cd benchmarks/scoreboard && python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.policy.PushPolicy
 
-- fingers.py: geometry of a finger
+- fingers.py: geometry of a finger, that of `examples/trifinger_lift.py`
 - control.py: torques that lead the tips along references
 - cube.py: where the cube is now, from a pose that is late
 - places.py: which finger could push where, and how it gets there
 - policy.py: `PushPolicy`, all of it together
 """
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).resolve().parents[3] / "examples"))

@@ -30,8 +30,6 @@ INPUT_WEIGHT = 0.1
 SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.002, switch_price=0.18, travel_price=0.0833, patience=75)
 WAIVED = replace(SETTINGS, smallest_gain=0.0, switch_price=0.0018, travel_price=0.000833)
 """Settings for states in which no journey is worth its price and nothing is gained, as beside the wall."""
-TRAVEL_SPEED, TRAVEL_ACCELERATION = 0.6, 7.0
-"""Of a tip [m/s, m/s²]."""
 WAIT_HEIGHT = 0.115
 """Of the tips that do not push [m]."""
 LEAD = 0.03
@@ -86,7 +84,7 @@ class PushPolicy(PolicyBase):
         q, v = robot["position"].astype(float), robot["velocity"].astype(float)
         tips, _ = self.control.tips(q)
         if self.reference is None:
-            self.reference = TipReference(tips, TRAVEL_SPEED, TRAVEL_ACCELERATION)
+            self.reference = TipReference(tips)
             self.waiting = tips.copy()
             self.waiting[:, 2] = WAIT_HEIGHT
             self._last = tips
