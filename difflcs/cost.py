@@ -9,19 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import (
-    broadcast_batch,
-    check_array,
-    check_kind,
-    check_number,
-    check_positive_int,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_tensor,
-    describe,
-    takes_arrays,
-)
+from difflcs import _checks
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._fields import TensorFields, check_by_stage, check_stages, register
 from difflcs._linalg import matvec, quadratic
@@ -49,9 +37,11 @@ class _Quadratic(TensorFields):
     @runs_eagerly
     def _fill(self, Q: Tensor, R: Tensor, Q_final: Tensor, check: bool, **others: Tensor | None) -> None:
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
-            check_tensor(name, value)
+            _checks.check_tensor(name, value)
             if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-                raise ShapeError(f"{name}: expected a square matrix (..., n, n), got {describe(value)}; pass one")
+                raise ShapeError(
+                    f"{name}: expected a square matrix (..., n, n), got {_checks.describe(value)}; pass one"
+                )
         self.n_x, self.n_u = Q.shape[-1], R.shape[-1]
         fields = {
             "Q": Q,
@@ -68,8 +58,8 @@ class _Quadratic(TensorFields):
         dims["constant_stage"] = []
         for name, dim in dims.items():
             if name in fields:
-                check_tensor(name, fields[name], dim)
-        check_same_device(fields.items())
+                _checks.check_tensor(name, fields[name], dim)
+        _checks.check_same_device(fields.items())
         if self.by_stage:
             check_stages({k: (fields[k], _DIMENSIONS[k], 0) for k in _STAGES if k in self.by_stage})
         if check:
@@ -86,7 +76,7 @@ class _Quadratic(TensorFields):
             value = fields[name].detach()
             staged = not self.by_stage or name in self.by_stage
             blocks.append(value if staged else value.unsqueeze(-3))
-        batch = broadcast_batch((name, block.shape[:-2]) for name, block in zip("QSR", blocks, strict=True))
+        batch = _checks.broadcast_batch((name, block.shape[:-2]) for name, block in zip("QSR", blocks, strict=True))
         Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)
         return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
@@ -124,7 +114,7 @@ class QuadraticCost(_Quadratic):
         InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue.
     """
 
-    @takes_arrays
+    @_checks.takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -177,7 +167,7 @@ class CostSequence(_Quadratic):
         InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue; no field is by stage.
     """
 
-    @takes_arrays
+    @_checks.takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -240,7 +230,7 @@ def cost_at(
     """
     value = fresh(cost).at(x, goal, context)
     remedy = f"return one of them from {type(cost).__name__}.at"
-    return check_kind("cost", value, (QuadraticCost, CostSequence), remedy)
+    return _checks.check_kind("cost", value, (QuadraticCost, CostSequence), remedy)
 
 
 def check_convex(name: str, matrix: Tensor) -> None:
@@ -290,7 +280,7 @@ class GoalCost(TensorFields):
     goal_final: Tensor
 
     @runs_eagerly
-    @takes_arrays
+    @_checks.takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -304,7 +294,7 @@ class GoalCost(TensorFields):
         super().__init__()
         QuadraticCost(Q.detach(), R.detach(), Q_final.detach())
         self.n_x, self.n_u = Q.shape[-1], R.shape[-1]
-        check_shape("goal_to_q", goal_to_q, "n_x n_goal", {"n_x": self.n_x})
+        _checks.check_shape("goal_to_q", goal_to_q, "n_x n_goal", {"n_x": self.n_x})
         self.n_goal = goal_to_q.shape[-1]
         square = goal_to_q.new_zeros(self.n_goal, self.n_goal)
         fields = {
@@ -318,13 +308,13 @@ class GoalCost(TensorFields):
         }
         x, goal = ("n_x", self.n_x), ("n_goal", self.n_goal)
         for name, rows in (("goal_to_q_final", x), ("goal_stage", goal), ("goal_final", goal)):
-            check_tensor(name, fields[name], [rows, goal])
-        check_same_device(fields.items())
-        check_same_dtype(fields)
+            _checks.check_tensor(name, fields[name], [rows, goal])
+        _checks.check_same_device(fields.items())
+        _checks.check_same_dtype(fields)
         for name, value in fields.items():
             register(self, name, value)
 
-    @takes_arrays
+    @_checks.takes_arrays
     def forward(self, goal: Tensor, horizon: int = 1) -> QuadraticCost:
         """Compute the cost of one goal per batch element.
 
@@ -337,7 +327,7 @@ class GoalCost(TensorFields):
         """
         return QuadraticCost(**self.at(goal, horizon), check=False)
 
-    @takes_arrays
+    @_checks.takes_arrays
     def follow(self, reference: Tensor) -> CostSequence:
         """Compute the cost of goals that move: stage k tracks goal k, the final state the last one.
 
@@ -389,9 +379,9 @@ class GoalCost(TensorFields):
         return self._held(("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"))
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
-        check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])
+        _checks.check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])
         if value.device != self.Q.device:
-            check_same_device([("cost", self.Q), (name, value)])
+            _checks.check_same_device([("cost", self.Q), (name, value)])
         return value.to(self.Q.dtype)
 
     def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
@@ -433,8 +423,8 @@ class GoalCost(TensorFields):
         Returns:
             A `GoalCost` with n_goal = len(goal_weight).
         """
-        n_x, n_u = check_positive_int("n_x", n_x), check_positive_int("n_u", n_u)
-        input_weight = check_number("input_weight", input_weight, strict=True)
+        n_x, n_u = _checks.check_positive_int("n_x", n_x), _checks.check_positive_int("n_u", n_u)
+        input_weight = _checks.check_number("input_weight", input_weight, strict=True)
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         final_pair = pair_weight if pair_weight_final is None else pair_weight_final
@@ -446,15 +436,16 @@ class GoalCost(TensorFields):
                 f"use 0 where a component does not count"
             )
         pairs = list(pairs) if isinstance(pairs, Iterable) else [pairs]
-        numbers = check_array("pairs", pairs)
+        numbers = _checks.check_array("pairs", pairs)
         apart = not pairs or (numbers.shape[1:] == (2,) and bool((numbers[:, 0] != numbers[:, 1]).all()))
         if not (apart and np.isin(numbers, np.arange(n_x)).all()):
             raise InvalidInputError(
-                f"pairs: expected pairs of two different indices in 0…{n_x - 1}, got {describe(pairs)}; correct them"
+                f"pairs: expected pairs of two different indices in 0…{n_x - 1}, got {_checks.describe(pairs)}; "
+                f"correct them"
             )
-        stage, to_q, constant = _tracking(n_x, weights, pairs, check_number("pair_weight", pair_weight), dtype)
+        stage, to_q, constant = _tracking(n_x, weights, pairs, _checks.check_number("pair_weight", pair_weight), dtype)
         final, to_q_final, constant_final = _tracking(
-            n_x, finals, pairs, check_number("pair_weight_final", final_pair), dtype
+            n_x, finals, pairs, _checks.check_number("pair_weight_final", final_pair), dtype
         )
         R = 2 * input_weight * torch.eye(n_u, dtype=dtype)
         return cls(stage, R, final, to_q, to_q_final, constant, constant_final)
@@ -467,7 +458,7 @@ def _weights(name: str, value: float | Sequence[float], n_x: int) -> list[float]
         weights = [value] * n_x
     if not 1 <= len(weights) <= n_x:
         raise ShapeError(f"{name}: expected 1 to n_x={n_x} weights, got {len(weights)}")
-    return [check_number(name, weight) for weight in weights]
+    return [_checks.check_number(name, weight) for weight in weights]
 
 
 def _tracking(

@@ -12,16 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import (
-    check_array,
-    check_dims,
-    check_number,
-    check_positive_int,
-    check_shape,
-    check_tensor,
-    describe,
-    takes_arrays,
-)
+from difflcs import _checks
 from difflcs._optional import require
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.losses import params_of_transitions
@@ -85,7 +76,7 @@ class Transitions(NamedTuple):
             pairs = [(s[a:b], u[a : b - 1]) for a, b in itertools.pairwise(cuts)]
         for k, (s, u) in enumerate(pairs):
             for name, value, first in zip(("states", "actions"), (s, u), pairs[0], strict=True):
-                check_tensor(f"{name}[{k}]", value, [("n", first.shape[1])])
+                _checks.check_tensor(f"{name}[{k}]", value, [("n", first.shape[1])])
             if len(s) != len(u) + 1:
                 raise ShapeError(
                     f"states[{k}]: expected one state more than the {len(u)} actions, got {len(s)}; keep the first and "
@@ -102,7 +93,7 @@ class Transitions(NamedTuple):
             share: of the episodes that are to test on, at least one, above 0 and below 1.
             seed: of the drawing.
         """
-        share = check_number("share", share, strict=True)
+        share = _checks.check_number("share", share, strict=True)
         number = (~_continues(self.x, self.x_next)).roll(1).cumsum(0) - 1
         number = number - number[0]
         count = int(number[-1]) + 1
@@ -111,7 +102,7 @@ class Transitions(NamedTuple):
                 f"share: expected less than 1 of at least two episodes, got {share:g} of {count}; "
                 f"split one long episode by hand"
             )
-        random = np.random.default_rng(check_positive_int("seed", seed, minimum=0))
+        random = np.random.default_rng(_checks.check_positive_int("seed", seed, minimum=0))
         drawn = random.permutation(count)[: min(max(1, round(share * count)), count - 1)]
         test = torch.isin(number, torch.as_tensor(drawn, device=number.device))
         return Transitions(*(v[~test] for v in self)), Transitions(*(v[test] for v in self))
@@ -180,7 +171,7 @@ class FitReport:
         return figure
 
 
-@takes_arrays
+@_checks.takes_arrays
 def fit_report(
     system: LCSModule | LCSParams,
     x: Tensor,
@@ -211,7 +202,7 @@ def fit_report(
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
-    horizon = check_positive_int("horizon", horizon)
+    horizon = _checks.check_positive_int("horizon", horizon)
     with torch.no_grad():
         params = params_of_transitions(system, x, u, x_next, context)
         if not x.ndim == u.ndim == x_next.ndim == 2 or not len(x) == len(u) == len(x_next) > 1:
@@ -263,8 +254,8 @@ def fit_report(
 
 def _rows(name: str, value: Any) -> Tensor:
     """Convert rows of numbers to a finite matrix in float64."""
-    rows = value.detach().double() if isinstance(value, Tensor) else torch.from_numpy(check_array(name, value))
-    return check_shape(name, rows, "T n", remedy="give one row for each step")
+    rows = value.detach().double() if isinstance(value, Tensor) else torch.from_numpy(_checks.check_array(name, value))
+    return _checks.check_shape(name, rows, "T n", remedy="give one row for each step")
 
 
 def _continues(x: Tensor, x_next: Tensor) -> Tensor:
@@ -287,10 +278,10 @@ def _keep_forces(params: LCSParams, kept: Sequence[int]) -> LCSParams:
 def _check_training(train: Any, x: Tensor, u: Tensor) -> Sequence[Tensor]:
     """Check transitions that something was fitted to, and convert them like these states and actions."""
     if not isinstance(train, Sequence) or len(train) != 3:
-        raise InvalidInputError(f"train: expected x, u and x_next, got {describe(train)}; give three tensors")
+        raise InvalidInputError(f"train: expected x, u and x_next, got {_checks.describe(train)}; give three tensors")
     train = [_rows(f"train {name}", value).to(x) for name, value in zip(("x", "u", "x_next"), train, strict=True)]
     for name, value, like in zip(("x", "u", "x_next"), train, (x, u, x), strict=True):
-        check_dims(f"train {name}", value, [("N", len(train[0])), ("n", like.shape[1])])
+        _checks.check_dims(f"train {name}", value, [("N", len(train[0])), ("n", like.shape[1])])
     return train
 
 

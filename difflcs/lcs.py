@@ -10,16 +10,7 @@ from typing import Any, Self, TypeGuard
 import torch
 from torch import Tensor, nn
 
-from difflcs import _storage
-from difflcs._checks import (
-    broadcast_batch,
-    check_choice,
-    check_kind,
-    check_number,
-    check_positive_int,
-    check_shape,
-    takes_arrays,
-)
+from difflcs import _checks, _storage
 from difflcs._differentiation import runs_eagerly, transforms_active
 from difflcs._linalg import product
 from difflcs._modules import fresh, plain_state, untouched
@@ -40,7 +31,7 @@ class PredictiveModule(nn.Module):
     params: Callable[..., Any]
 
     @runs_eagerly
-    @takes_arrays
+    @_checks.takes_arrays
     def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
         """Predict one step through the exact LCP.
 
@@ -52,11 +43,11 @@ class PredictiveModule(nn.Module):
             x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every parameter.
         """
         self.check_inputs(x=x, u=u)
-        broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
+        _checks.broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
         return advance(self.params(x), x, u)
 
     @runs_eagerly
-    @takes_arrays
+    @_checks.takes_arrays
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory.
 
@@ -67,9 +58,9 @@ class PredictiveModule(nn.Module):
         Returns:
             (..., T+1, n_x) states, x0 first.
         """
-        check_shape("u_seq", u_seq, "... T n_u", {"n_u": self.n_u}, "add a dimension of steps")
+        _checks.check_shape("u_seq", u_seq, "... T n_u", {"n_u": self.n_u}, "add a dimension of steps")
         self.check_inputs(x0=x0, u_seq=u_seq)
-        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
+        batch = _checks.broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
         states = [x0.expand(*batch, self.n_x)]
         for t in range(u_seq.shape[-2]):
             states.append(self(states[-1], u_seq[..., t, :]).x_next)
@@ -139,21 +130,21 @@ class LCSModel(PredictiveModule):
         action_support: Tensor | None = None,
     ):
         super().__init__()
-        self.n_x = check_positive_int("n_x", n_x)
-        self.n_u = check_positive_int("n_u", n_u)
-        self.n_lam = check_positive_int("n_lam", n_lam, minimum=0)
-        self.stiffness = check_number("stiffness", stiffness, strict=True)
-        init_scale = check_number("init_scale", init_scale)
-        check_kind("generator", generator, (torch.Generator, type(None)), "torch.Generator().manual_seed(0)")
+        self.n_x = _checks.check_positive_int("n_x", n_x)
+        self.n_u = _checks.check_positive_int("n_u", n_u)
+        self.n_lam = _checks.check_positive_int("n_lam", n_lam, minimum=0)
+        self.stiffness = _checks.check_number("stiffness", stiffness, strict=True)
+        init_scale = _checks.check_number("init_scale", init_scale)
+        _checks.check_kind("generator", generator, (torch.Generator, type(None)), "torch.Generator().manual_seed(0)")
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         for name, shape in self._shapes(self.n_x, self.n_u, self.n_lam).items():
             draw = torch.rand(shape, generator=generator, dtype=torch.float64)
             value = torch.zeros(shape) if name == "c" else init_scale * (2 * draw - 1)
             self.register_parameter(name, nn.Parameter(value.to(dtype)))
-        self.c.requires_grad_(check_kind("learn_c", learn_c, bool))
+        self.c.requires_grad_(_checks.check_kind("learn_c", learn_c, bool))
         if action_support is not None:
-            support = check_shape("action_support", action_support, f"2 {self.n_u}")
+            support = _checks.check_shape("action_support", action_support, f"2 {self.n_u}")
             check_bounds(support[0], support[1])
             action_support = support.detach().to(dtype, copy=True)
         self.register_buffer("action_support", action_support)
@@ -226,7 +217,7 @@ class LCSModel(PredictiveModule):
         Returns:
             A model whose `params()` equal `params` up to rounding.
         """
-        check_kind("params", params, LCSParams)
+        _checks.check_kind("params", params, LCSParams)
         if len(params.batch_shape):
             raise ShapeError(f"params: expected no batch dimensions, got {tuple(params.batch_shape)}; index one system")
         params = params.detach()
@@ -234,7 +225,7 @@ class LCSModel(PredictiveModule):
         smallest = float(torch.linalg.eigvalsh(symmetric)[0]) if params.n_lam else float("inf")
         if stiffness is None:
             stiffness = 0.5 * smallest if params.n_lam else 0.1
-        stiffness = check_number("stiffness", stiffness, strict=True)
+        stiffness = _checks.check_number("stiffness", stiffness, strict=True)
         if stiffness >= smallest:
             raise InvalidInputError(
                 f"stiffness: expected less than the smallest eigenvalue {smallest:.3e} of (F + Fᵀ)/2, got {stiffness:g}"
@@ -274,11 +265,11 @@ class LCSModel(PredictiveModule):
                 f"was it written by LCSModel.save_pretrained?"
             )
         try:
-            dtype = _DTYPES[check_choice("dtype", config["dtype"], tuple(_DTYPES))]
-            n_x, n_u = (check_positive_int(k, config[k]) for k in ("n_x", "n_u"))
-            n_lam = check_positive_int("n_lam", config["n_lam"], minimum=0)
-            stiffness = check_number("stiffness", config["stiffness"], strict=True)
-            learn_c = check_kind("learn_c", config["learn_c"], bool, "save the model again")
+            dtype = _DTYPES[_checks.check_choice("dtype", config["dtype"], tuple(_DTYPES))]
+            n_x, n_u = (_checks.check_positive_int(k, config[k]) for k in ("n_x", "n_u"))
+            n_lam = _checks.check_positive_int("n_lam", config["n_lam"], minimum=0)
+            stiffness = _checks.check_number("stiffness", config["stiffness"], strict=True)
+            learn_c = _checks.check_kind("learn_c", config["learn_c"], bool, "save the model again")
         except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made

@@ -8,16 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import (
-    broadcast_batch,
-    check_choice,
-    check_kind,
-    check_number,
-    check_tensor,
-    describe,
-    is_array,
-    takes_arrays,
-)
+from difflcs import _checks
 from difflcs._differentiation import Gradients, Solver, Tensors, runs_eagerly, solve, transforms_active
 from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
@@ -36,7 +27,7 @@ _RANKS = (*map(len, SYSTEM.values()), 1, 1, 1)
 
 
 @runs_eagerly
-@takes_arrays
+@_checks.takes_arrays
 def violation_loss(
     lcs: LCSModule | LCSParams,
     x: Tensor,
@@ -83,12 +74,12 @@ def violation_loss(
             1e-6 of the Cᵀr that it balances those of its gradient. The message names the limits.
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
-    check_choice("reduction", reduction, ("mean", "none"))
-    xi = check_number("xi", xi, strict=True)
+    _checks.check_choice("reduction", reduction, ("mean", "none"))
+    xi = _checks.check_number("xi", xi, strict=True)
     if isinstance(gamma, Tensor):  # γ has no gradient, nor is it one per transition
-        raise DTypeError(f"gamma: expected a number, got {describe(gamma)}; convert it with float(...)")
+        raise DTypeError(f"gamma: expected a number, got {_checks.describe(gamma)}; convert it with float(...)")
     if not (isinstance(gamma, str) and gamma == "auto"):
-        gamma = check_number("gamma", gamma)
+        gamma = _checks.check_number("gamma", gamma)
     data = (x, u, x_next)
     if is_plain(lcs) and lcs.n_lam and not transforms_active():
         # The solver passes the gradient of F to G and H itself: autograd would take 40 µs for the five small steps, of
@@ -102,8 +93,8 @@ def violation_loss(
             return _violation_loss(system, data, x.shape[:-1], gamma, xi, reduction, factors)
         lcs.check_inputs(x=x, u=u, x_next=x_next)
         for name, value in zip(SYSTEM, system, strict=True):
-            check_tensor(name, value)
-        batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
+            _checks.check_tensor(name, value)
+        batch = _checks.broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
     else:
         params, factors = params_of_transitions(lcs, x, u, x_next, context), ()
         if not params.n_lam:
@@ -115,7 +106,7 @@ def violation_loss(
 
 
 @runs_eagerly
-@takes_arrays
+@_checks.takes_arrays
 def prediction_loss(
     lcs: LCSModule | LCSParams,
     x: Tensor,
@@ -140,7 +131,7 @@ def prediction_loss(
     Returns:
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
     """
-    check_choice("reduction", reduction, ("mean", "none"))
+    _checks.check_choice("reduction", reduction, ("mean", "none"))
     return _prediction_loss(params_of_transitions(lcs, x, u, x_next, context), x, u, x_next, reduction)
 
 
@@ -160,22 +151,22 @@ def params_of_transitions(
 ) -> LCSParams:
     """Return the system of some transitions, after a check that they fit it."""
     if context is not None:
-        check_tensor("context", context)
+        _checks.check_tensor("context", context)
     if isinstance(lcs, LCSParams):
         if context is not None:
             raise InvalidInputError(
-                f"context: expected None beside LCSParams, which depend on nothing, got {describe(context)}; leave it "
-                f"out, or pass an LCSModule"
+                f"context: expected None beside LCSParams, which depend on nothing, got {_checks.describe(context)}; "
+                f"leave it out, or pass an LCSModule"
             )
         params = lcs
     elif isinstance(lcs, LCSModule):
-        check_tensor("x", x, [("n_x", lcs.n_x)])
+        _checks.check_tensor("x", x, [("n_x", lcs.n_x)])
         params = system_at(lcs, x, context)
         remedy = "transitions have no stages: give the system of each by batch dimensions"
-        params = check_kind(f"{type(lcs).__name__}.params", params, LCSParams, remedy)
+        params = _checks.check_kind(f"{type(lcs).__name__}.params", params, LCSParams, remedy)
     else:
         raise DTypeError(
-            f"lcs: expected an LCSModel, another LCSModule or LCSParams, got {describe(lcs)}; the stages of a "
+            f"lcs: expected an LCSModel, another LCSModule or LCSParams, got {_checks.describe(lcs)}; the stages of a "
             f"sequence become a batch by LCSParams(**sequence.tensors())"
         )
     params.check_inputs(x=x, u=u, x_next=x_next)
@@ -184,7 +175,7 @@ def params_of_transitions(
 
 def _batch(params: LCSParams, x: Tensor, u: Tensor, x_next: Tensor) -> torch.Size:
     named = {"x": x, "u": u, "x_next": x_next}
-    return broadcast_batch([("the system", params.batch_shape), *((k, v.shape[:-1]) for k, v in named.items())])
+    return _checks.broadcast_batch([("the system", params.batch_shape), *((k, v.shape[:-1]) for k, v in named.items())])
 
 
 def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
@@ -199,7 +190,7 @@ def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) 
         if value.dtype is not torch.float64 or not value.is_cpu or value.layout is not torch.strided:
             return False
     for value, size in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True):
-        if not is_array(value) or value.dtype is not torch.float64 or value.shape != (len(data[0]), size):
+        if not _checks.is_array(value) or value.dtype is not torch.float64 or value.shape != (len(data[0]), size):
             return False
     return True
 
@@ -274,7 +265,7 @@ class _Transitions(Solver):
         if lost is None:
             # A number that is not finite, a γ at or above its bound, or an empty batch.
             for name, tensor in zip((*SYSTEM, "x", "u", "x_next"), tensors, strict=False):
-                check_tensor(name, tensor)
+                _checks.check_tensor(name, tensor)
             check_gamma_range(arrays[6].astype(np.float64), arrays[11])
             z = minimise_over_orthant(Q, q)
             lost = _kernels.violation_value(arrays, self.xi, z, r, e, loss)

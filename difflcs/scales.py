@@ -11,17 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from difflcs import _storage
-from difflcs._checks import (
-    broadcast_batch,
-    check_kind,
-    check_number,
-    check_same_device,
-    check_tensor,
-    describe,
-    takes_arrays,
-    to_tensor,
-)
+from difflcs import _checks, _storage
 from difflcs._linalg import matvec
 from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, InvalidInputError, ShapeError
@@ -60,25 +50,29 @@ class Scales:
 
     def __post_init__(self) -> None:
         for name in ("center", "state", "action"):
-            value = check_tensor(name, to_tensor(getattr(self, name)))
+            value = _checks.check_tensor(name, _checks.to_tensor(getattr(self, name)))
             if value.ndim != 1 or (name == "state" and value.shape != self.center.shape):
-                raise ShapeError(f"{name}: expected a number for each state or action, got {describe(value)}; see help")
+                raise ShapeError(
+                    f"{name}: expected a number for each state or action, got {_checks.describe(value)}; see help"
+                )
             if name != "center" and not bool((value > 0).all()):
-                raise InvalidInputError(f"{name}: expected units above 0, got {describe(value)}; 1 where none is known")
+                raise InvalidInputError(
+                    f"{name}: expected units above 0, got {_checks.describe(value)}; 1 where none is known"
+                )
             vars(self)[name] = value
         for name in ("xi", "relaxation"):
-            vars(self)[name] = check_number(name, getattr(self, name), strict=True)
+            vars(self)[name] = _checks.check_number(name, getattr(self, name), strict=True)
 
-    @takes_arrays
+    @_checks.takes_arrays
     def normalise(self, x: Tensor, u: Tensor, x_next: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Convert transitions x (..., n_x), u (..., n_u), x_next (..., n_x) to these units."""
-        check_tensor("u", u, [("n_u", len(self.action))])
+        _checks.check_tensor("u", u, [("n_u", len(self.action))])
         return self.states(x), u / self.action.to(u), self.states(x_next, "x_next")
 
-    @takes_arrays
+    @_checks.takes_arrays
     def states(self, x: Tensor, name: str = "x") -> Tensor:
         """Convert states (..., n_x) to these units; `name` is their name in an error."""
-        check_tensor(name, x, [("n_x", len(self.state))])
+        _checks.check_tensor(name, x, [("n_x", len(self.state))])
         return (x - self.center.to(x)) / self.state.to(x)
 
     def params(self, params: Record) -> Record:
@@ -87,7 +81,7 @@ class Scales:
         A = S Ã S⁻¹, B = S B̃ U⁻¹, C = S C̃, d = S d̃ + m − A m, D = D̃ S⁻¹, E = Ẽ U⁻¹, F = F̃, c = c̃ − D m, with m, S and
         U from center, state and action.
         """
-        check_kind("params", params, (LCSParams, LCSSequence))
+        _checks.check_kind("params", params, (LCSParams, LCSSequence))
         m, S, U = (v.to(params.A) for v in (self.center, self.state, self.action))
         if (params.n_x, params.n_u) != (len(S), len(U)):
             raise InvalidInputError(
@@ -107,7 +101,7 @@ class Scales:
         )
 
 
-@takes_arrays
+@_checks.takes_arrays
 def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     """Suggest units and settings for learning an LCS; the learned system does not depend on the units of the data.
 
@@ -137,14 +131,15 @@ def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
             or no state ever changes.
     """
     for name, value in (("x", x), ("u", u), ("x_next", x_next)):
-        check_tensor(name, value)
+        _checks.check_tensor(name, value)
         if value.ndim < 2:
             raise InvalidInputError(
-                f"{name}: expected shape (..., n) of many transitions, got {describe(value)}; give a batch of them"
+                f"{name}: expected shape (..., n) of many transitions, got {_checks.describe(value)}; give a "
+                f"batch of them"
             )
-    check_tensor("x_next", x_next, [("n_x", x.shape[-1])], finite=False)
-    check_same_device([("x", x), ("u", u), ("x_next", x_next)])
-    batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
+    _checks.check_tensor("x_next", x_next, [("n_x", x.shape[-1])], finite=False)
+    _checks.check_same_device([("x", x), ("u", u), ("x_next", x_next)])
+    batch = _checks.broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
     if batch.numel() < 2:
         raise InvalidInputError(f"x: expected at least two transitions, got {batch.numel()}; give more data")
     x, u, x_next = (v.detach().double().expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
@@ -169,8 +164,8 @@ class ScaledLCS(PredictiveModule):
 
     def __init__(self, lcs: LCSModule, scales: Scales):
         super().__init__()
-        check_kind("lcs", lcs, LCSModule)
-        check_kind("scales", scales, Scales)
+        _checks.check_kind("lcs", lcs, LCSModule)
+        _checks.check_kind("scales", scales, Scales)
         self.lcs, self.scales = lcs, scales
         self.n_x, self.n_u, self.n_lam = lcs.n_x, lcs.n_u, lcs.n_lam
 
@@ -188,7 +183,7 @@ class ScaledLCS(PredictiveModule):
         Raises:
             DTypeError: the module within is no `LCSModel`; save its `state_dict` and the scales yourself.
         """
-        lcs = check_kind("lcs", self.lcs, LCSModel, "save its state_dict() and the scales")
+        lcs = _checks.check_kind("lcs", self.lcs, LCSModel, "save its state_dict() and the scales")
         tensors = {f"scales.{name}": getattr(self.scales, name) for name in ("center", "state", "action")}
         tensors |= {f"lcs.{name}": value for name, value in plain_state(lcs).items()}
         numbers = {"xi": self.scales.xi, "relaxation": self.scales.relaxation}
@@ -209,7 +204,7 @@ class ScaledLCS(PredictiveModule):
             parts.setdefault(part, {})[rest] = value
         settings, inner = {name: config.get(name) for name in ("xi", "relaxation")}, config.get("lcs")
         try:
-            numbers = {name: check_number(name, value, strict=True) for name, value in settings.items()}
+            numbers = {name: _checks.check_number(name, value, strict=True) for name, value in settings.items()}
         except InvalidInputError as error:
             raise CheckpointError(f"{directory}: its scales cannot be used: {error}") from error
         if not isinstance(inner, Mapping):

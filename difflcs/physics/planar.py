@@ -25,16 +25,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from difflcs._checks import (
-    broadcast_batch,
-    check_array,
-    check_choice,
-    check_kind,
-    check_number,
-    check_positive_int,
-    check_tensor,
-    describe,
-)
+from difflcs import _checks
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces, given_states
@@ -127,7 +118,7 @@ class PDDrive(Drive):
 
     def step(self) -> DriveStep:
         """See `Drive`."""
-        return self._until(check_positive_int("substeps", self.substeps))
+        return self._until(_checks.check_positive_int("substeps", self.substeps))
 
     def course(self) -> DriveStep:
         """See `Drive`: after each substep."""
@@ -136,9 +127,9 @@ class PDDrive(Drive):
 
     def _until(self, substeps: int) -> DriveStep:
         kp, kv = _number("stiffness", self.stiffness, 0.0), _number("damping", self.damping, 0.0)
-        broadcast_batch([("stiffness", kp.shape), ("damping", kv.shape)])
+        _checks.broadcast_batch([("stiffness", kp.shape), ("damping", kv.shape)])
         kp, kv = torch.broadcast_tensors(kp, kv)
-        h = check_number("substep", self.substep, strict=True)
+        h = _checks.check_number("substep", self.substep, strict=True)
         one, zero = torch.ones_like(kp), torch.zeros_like(kp)
         # (p, v, target)₊ = M (p, v, target), for one substep.
         M = torch.stack(
@@ -174,9 +165,9 @@ class ForceDrive(Drive):
     def step(self) -> DriveStep:
         """See `Drive`."""
         mass, damping = _number("mass", self.mass, 0.0, True), _number("damping", self.damping, 0.0)
-        broadcast_batch([("mass", mass.shape), ("damping", damping.shape)])
+        _checks.broadcast_batch([("mass", mass.shape), ("damping", damping.shape)])
         mass, damping = torch.broadcast_tensors(mass, damping)
-        h = check_number("seconds", self.seconds, strict=True)
+        h = _checks.check_number("seconds", self.seconds, strict=True)
         decay = torch.exp(-damping * h)
         one, zero = torch.ones_like(mass), torch.zeros_like(mass)
         A = torch.stack([torch.stack([one, h * decay], -1), torch.stack([zero, decay], -1)], -2)
@@ -236,13 +227,13 @@ class PlanarPushing:
     nearest: int | None = None
 
     def __post_init__(self) -> None:
-        check_kind("shape", self.shape, Shape, "give Circle, Polygon or Union")
-        check_kind("drive", self.drive, Drive, "give PositionDrive(), for example")
-        check_kind("inertia", self.inertia, (Inertia, type(None)))
-        check_positive_int("n_discs", self.n_discs)
+        _checks.check_kind("shape", self.shape, Shape, "give Circle, Polygon or Union")
+        _checks.check_kind("drive", self.drive, Drive, "give PositionDrive(), for example")
+        _checks.check_kind("inertia", self.inertia, (Inertia, type(None)))
+        _checks.check_positive_int("n_discs", self.n_discs)
         if self.nearest is not None:
-            check_positive_int("nearest", self.nearest)
-        check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
+            _checks.check_positive_int("nearest", self.nearest)
+        _checks.check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
         defaults = [name for name in ("center_of_mass", "gyration", "length") if getattr(self, name) is None]
         vars(self)["defaults"] = dict.fromkeys(defaults)
         rough = () if self.frictionless else ("friction",)
@@ -255,7 +246,7 @@ class PlanarPushing:
             gyration = (polar / area + (values["center_of_mass"] - centroid).square().sum()).sqrt()
         values["gyration"] = _number("gyration", gyration, 0.0, strict=True, sizes=[(), (1,)])
         length = float(values["gyration"].detach()) if self.length is None else self.length
-        values["length"] = check_number("length", length, strict=True)
+        values["length"] = _checks.check_number("length", length, strict=True)
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -298,7 +289,7 @@ class PlanarPushing:
         Raises:
             InvalidInputError and its kinds: no state, or of another size.
         """
-        check_tensor("x", x := given_states(x), [("n_x", self.n_x)])
+        _checks.check_tensor("x", x := given_states(x), [("n_x", self.n_x)])
         if not x.is_cpu or x.dtype is not torch.float64:  # computed so, as plans are
             return self.params(x.to("cpu", torch.float64), context).to(x.device, x.dtype)
         if any(getattr(self, name).requires_grad for name in vars(self)["defaults"] if name != "length"):
@@ -329,7 +320,7 @@ class PlanarPushing:
 
     def contacts(self, x: Tensor) -> Contacts:
         """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
-        check_tensor("x", x, [("n_x", self.n_x)])
+        _checks.check_tensor("x", x, [("n_x", self.n_x)])
         m, parts, batch = self.n_discs, self.parts_touched, x.shape[:-1]
         discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
         nearest = self.shape.distance(to_body(x, discs))
@@ -380,7 +371,7 @@ class PlanarPushing:
             return kept[0].clone(), kept[1].clone(), kept[2]  # what a caller gets is theirs
         m, n_x, h = self.n_discs, self.n_x, 0.0
         if self.inertia is not None:
-            h = check_number("seconds", self.inertia.seconds, strict=True)
+            h = _checks.check_number("seconds", self.inertia.seconds, strict=True)
             _number("mass", self.inertia.mass, 0.0, True, [(), (1,)])
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
@@ -463,11 +454,11 @@ def _number(
     `sizes`: those that it may have, where not any.
     """
     if not isinstance(value, Tensor):
-        value = torch.from_numpy(check_array(name, value))
-    check_tensor(name, value)
+        value = torch.from_numpy(_checks.check_array(name, value))
+    _checks.check_tensor(name, value)
     if sizes and value.shape not in sizes:
         wanted = " or ".join(str(size) if size else "a number" for size in sizes)
-        raise ShapeError(f"{name}: expected {wanted}, got {describe(value)}; give so many")
+        raise ShapeError(f"{name}: expected {wanted}, got {_checks.describe(value)}; give so many")
     if least > -math.inf and not is_wrapped(value) and bool(((value <= least) if strict else (value < least)).any()):
         raise InvalidInputError(
             f"{name}: expected numbers {'above' if strict else 'of at least'} {least:g}, got {float(value.min()):g}; "

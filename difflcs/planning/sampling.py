@@ -28,16 +28,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import (
-    check_array,
-    check_kind,
-    check_list,
-    check_number,
-    check_positive_int,
-    check_shape,
-    check_tensor,
-    make_plain,
-)
+from difflcs import _checks
 from difflcs.constraints import LinearConstraints
 from difflcs.errors import InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
@@ -79,13 +70,13 @@ class SamplingSettings:
     patience: int = 40
 
     def __post_init__(self) -> None:
-        make_plain(self)
+        _checks.make_plain(self)
         for field in fields(self):
             if field.name != "patience":
-                check_number(field.name, getattr(self, field.name))
+                _checks.check_number(field.name, getattr(self, field.name))
         if self.keep > 1:
             raise InvalidInputError(f"keep: expected at most 1, got {self.keep:g}; it is a part of the best score")
-        check_positive_int("patience", self.patience)
+        _checks.check_positive_int("patience", self.patience)
 
 
 @dataclass(frozen=True)
@@ -160,20 +151,22 @@ class SamplingPolicy:
         angles: Sequence[int] = (),
         constraints: Rows | None = None,
     ):
-        check_kind("mpc", mpc, LCSMPCLayer, "build one around your LCSModule")
+        _checks.check_kind("mpc", mpc, LCSMPCLayer, "build one around your LCSModule")
         if mpc.on_failure != "mask":
             raise InvalidInputError(
                 'mpc: expected a layer with on_failure="mask", got "raise"; one place without a solution must not stop '
                 "the others"
             )
         for name, function in (("bounds", bounds), ("constraints", constraints)):
-            check_kind(name, function, (Callable, type(None)), "give a function of states")
+            _checks.check_kind(name, function, (Callable, type(None)), "give a function of states")
         self.mpc, self.bounds, self.constraints = mpc, bounds, constraints
-        self.places = check_kind("places", places, Places, "give DiscPlaces, for example")
-        self.travel = check_kind("travel", travel, Travel, "give PlanarTravel, for example")
-        self.settings = check_kind("settings", SamplingSettings() if settings is None else settings, SamplingSettings)
-        angles = check_list("angles", angles, "give components of the goal, such as (2,)")
-        self.angles = [check_positive_int("angles", index, minimum=0) for index in angles]
+        self.places = _checks.check_kind("places", places, Places, "give DiscPlaces, for example")
+        self.travel = _checks.check_kind("travel", travel, Travel, "give PlanarTravel, for example")
+        self.settings = _checks.check_kind(
+            "settings", SamplingSettings() if settings is None else settings, SamplingSettings
+        )
+        angles = _checks.check_list("angles", angles, "give components of the goal, such as (2,)")
+        self.angles = [_checks.check_positive_int("angles", index, minimum=0) for index in angles]
         self.reset()
 
     def reset(self) -> None:
@@ -217,10 +210,10 @@ class SamplingPolicy:
 
     def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
         n_x = str(self.mpc.lcs.n_x)
-        state = check_shape("x", torch.from_numpy(check_array("x", x)), n_x, remedy="give one robot's")
+        state = _checks.check_shape("x", torch.from_numpy(_checks.check_array("x", x)), n_x, remedy="give one robot's")
         if goal is None:
             return state, None
-        target = check_tensor("goal", torch.from_numpy(check_array("goal", goal)))
+        target = _checks.check_tensor("goal", torch.from_numpy(_checks.check_array("goal", goal)))
         if target.ndim != 1 or any(index >= len(target) for index in self.angles):
             raise ShapeError(
                 f"goal: expected one vector that has the angles {self.angles}, got shape {tuple(target.shape)}; "
@@ -286,7 +279,7 @@ class SamplingPolicy:
             scores[best] = -math.inf
 
     def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
-        low, high = (None, None) if self.bounds is None else check_kind("bounds(x)", self.bounds(states), tuple)
+        low, high = (None, None) if self.bounds is None else _checks.check_kind("bounds(x)", self.bounds(states), tuple)
         rows = None if self.constraints is None else self.constraints(states)
         with warnings.catch_warnings():  # what was not solved is in the decision
             warnings.simplefilter("ignore", SolveWarning)
