@@ -297,7 +297,7 @@ def test_a_model_with_params_of_its_own_is_asked_for_them(build, data):
             fields = super().params().tensors()
             return LCSParams(**{**fields, "d": fields["d"] + x})
 
-    shifted = Shifted(4, 2, 3)
+    shifted = Shifted(4, 2, 3, stiffness=0.2)
     shifted.load_state_dict(build.model(seed=3).state_dict())
     for function in (violation_loss, prediction_loss):
         found = function(shifted, *data, reduction="none")
