@@ -19,14 +19,7 @@ from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSourc
 from difflcs.constraints import StageBounds, check_bounds
 from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, InvalidInputError, NonFiniteError, ShapeError, SolveError
-from difflcs.mpc.controller_file import (
-    check_constant,
-    constant_setup,
-    controller_bytes,
-    gather_at_zero,
-    make_problem,
-    numbers_of_one,
-)
+from difflcs.mpc import controller_file
 from difflcs.mpc.setup import PLAIN_COSTS, Call, Cost, Inputs, Setup, System, gather
 from difflcs.records import SYSTEM, LCSParams, LCSSequence
 from difflcs.status import Status
@@ -102,7 +95,7 @@ class MPCController:
 
     def __init__(self, setup: Setup, on_failure: OnFailure = "hold", time_limit: float | None = None):
         limit = getattr(setup.backend, "time_limit", None) if time_limit is None else time_limit
-        self._setup = setup = constant_setup(setup)
+        self._setup = setup = controller_file.constant_setup(setup)
         self._content = b""
         self._native: Any = None
         n_goal = setup.cost.n_goal if isinstance(setup.cost, GoalCost) else 0  # a module may take any goal
@@ -110,7 +103,7 @@ class MPCController:
         known = {"lcs": (LCSParams, LCSSequence), "cost": PLAIN_COSTS}
         self._modules = frozenset(name for name, kinds in known.items() if not isinstance(getattr(setup, name), kinds))
         if not self._modules:
-            self._make(gather_at_zero(setup))
+            self._make(controller_file.gather_at_zero(setup))
 
     def _begin(
         self, horizon: int, n_x: int, n_u: int, n_goal: int, on_failure: OnFailure, time_limit: float | None
@@ -140,8 +133,8 @@ class MPCController:
         """Make the native controller of the first problem."""
         assert self._setup is not None
         check_finite({name: inputs.tensors[name] for name in SYSTEM})
-        problem, self._constant = make_problem(self._setup, inputs)
-        self._content = controller_bytes(self._setup, problem, self._constant)
+        problem, self._constant = controller_file.make_problem(self._setup, inputs)
+        self._content = controller_file.controller_bytes(self._setup, problem, self._constant)
         self._first_inputs = {name: getattr(problem, name).clone() for names in _CHANGES.values() for name in names}
         self._load()
 
@@ -189,7 +182,7 @@ class MPCController:
             InvalidInputError: system or cost may depend on the state.
         """
         if self._setup is not None:
-            check_constant(self._setup)
+            controller_file.check_constant(self._setup)
         _storage.write_atomically(Path(path), self._content)
 
     def step(
@@ -300,7 +293,7 @@ class MPCController:
 
     def _set_inputs(self, setup: Setup, inputs: Inputs, overrides: dict[str, Any]) -> None:
         """Replace the numbers of the problem by others of the same shapes."""
-        values, constant = numbers_of_one(inputs)
+        values, constant = controller_file.numbers_of_one(inputs)
         fields = dict(self._first_inputs)
         for part, names in _CHANGES.items():  # bounds may depend on the state if the layer's system does
             if part in self._modules or overrides[part] is not None or part in ("u_min", "u_max"):

@@ -11,15 +11,7 @@ import torch
 from difflcs import __version__, _storage
 from difflcs._checks import describe
 from difflcs.errors import InvalidInputError
-from difflcs.mpc import LCSMPCLayer
-from difflcs.mpc.controller_file import (
-    VERSION,
-    check_constant,
-    constant_setup,
-    controller_bytes,
-    gather_at_zero,
-    make_problem,
-)
+from difflcs.mpc import LCSMPCLayer, controller_file
 
 CONTROLLER, DESCRIPTION = "controller.difflcs", "controller.json"
 
@@ -47,14 +39,14 @@ def export_controller(
         further = json.loads(json.dumps(about or {}, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"about: expected finite values in JSON types, got: {error}; convert them") from error
-    setup = constant_setup(mpc.setup())
-    check_constant(setup)
-    problem, constant = make_problem(setup, gather_at_zero(setup))
-    content = controller_bytes(setup, problem, constant, step_seconds)
+    setup = controller_file.constant_setup(mpc.setup())
+    controller_file.check_constant(setup)
+    problem, constant = controller_file.make_problem(setup, controller_file.gather_at_zero(setup))
+    content = controller_file.controller_bytes(setup, problem, constant, step_seconds)
     low, high = mpc.limits()
     description = {
         **further,
-        "format": VERSION,
+        "format": controller_file.VERSION,
         "difflcs": __version__,
         "file": CONTROLLER,
         "bytes": len(content),

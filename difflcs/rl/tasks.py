@@ -19,15 +19,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from difflcs._checks import (
-    check_kind,
-    check_number,
-    check_positive_int,
-    check_tensor,
-    describe,
-    did_you_mean,
-    make_plain,
-)
+from difflcs import _checks
 from difflcs._optional import require
 from difflcs.cost import CostModule, GoalCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
@@ -50,7 +42,7 @@ def compute_features(
 ) -> Tensor:
     """Compute the features of states, and of their contexts if there are any; raise if they are not finite."""
     seen = (state, goal, elapsed)
-    return check_tensor("features", features(*seen) if context is None else features(*seen, context))
+    return _checks.check_tensor("features", features(*seen) if context is None else features(*seen, context))
 
 
 def count_features(features: Features, *sizes: Sequence[int]) -> int:
@@ -65,10 +57,10 @@ def count_features(features: Features, *sizes: Sequence[int]) -> int:
     except TypeError as error:
         wanted = ", ".join(("state", "goal", "elapsed", "context")[: len(sizes)])
         raise DTypeError(
-            f"features: expected a function ({wanted}) → (..., n), got {describe(features)}: {error}"
+            f"features: expected a function ({wanted}) → (..., n), got {_checks.describe(features)}: {error}"
         ) from error
     of_two = features(*seen)
-    found = check_tensor("features", of_two, finite=False)
+    found = _checks.check_tensor("features", of_two, finite=False)
     if found.shape[:-1] != (2,):
         raise ShapeError(f"features: expected (2, n) of two states, got {tuple(found.shape)}; return (..., n)")
     return found.shape[-1]
@@ -127,17 +119,17 @@ class PhysicsSpec:
     told: str = ""
 
     def __post_init__(self) -> None:
-        make_plain(self)
+        _checks.make_plain(self)
         for name in ("make_system", "make_cost"):
             value = getattr(self, name)
             if not callable(value) and not (name == "make_cost" and value is None):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.PhysicsSpec")
         for value in self.scale:
-            check_number("scale", value, strict=True)
+            _checks.check_number("scale", value, strict=True)
         if self.horizon is not None:
-            check_positive_int("horizon", self.horizon, maximum=10**6)
+            _checks.check_positive_int("horizon", self.horizon, maximum=10**6)
         if self.relaxation is not None:
-            check_number("relaxation", self.relaxation, strict=True)
+            _checks.check_number("relaxation", self.relaxation, strict=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,22 +203,22 @@ class TaskSpec:
     physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
-        make_plain(self)
+        _checks.make_plain(self)
         if not isinstance(self.name, str) or not self.name.replace("_", "").replace("-", "").isalnum():
             raise InvalidInputError(
                 f"name: expected letters, digits, '-' and '_', got {self.name!r:.100}; it becomes a part of file names"
             )
         for name in ("horizon", "episode_steps"):
-            check_positive_int(name, getattr(self, name), maximum=10**6)
-        check_positive_int("n_context", self.n_context, minimum=0, maximum=10**6)
+            _checks.check_positive_int(name, getattr(self, name), maximum=10**6)
+        _checks.check_positive_int("n_context", self.n_context, minimum=0, maximum=10**6)
         for name in ("step_seconds", "relaxation"):
-            check_number(name, getattr(self, name), strict=True)
-        check_number("failure_penalty", self.failure_penalty)
+            _checks.check_number(name, getattr(self, name), strict=True)
+        _checks.check_number("failure_penalty", self.failure_penalty)
         for name in ("env", "make_cost", "features", "outcome", "describe"):
             value = getattr(self, name)
             if isinstance(value, GoalCost) or not (callable(value) or (name == "env" and isinstance(value, str))):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
-        check_kind("physics", self.physics, (PhysicsSpec, type(None)), "wrap what makes the system in one")
+        _checks.check_kind("physics", self.physics, (PhysicsSpec, type(None)), "wrap what makes the system in one")
         for name in ("u_min", "u_max"):
             if (shape := torch.as_tensor(getattr(self, name)).shape) not in ((), (1,), (self.n_u,)):
                 raise InvalidInputError(
@@ -425,7 +417,7 @@ def register_task(spec: TaskSpec) -> TaskSpec:
     Raises:
         DTypeError: not a `TaskSpec`.
     """
-    check_kind("spec", spec, TaskSpec)
+    _checks.check_kind("spec", spec, TaskSpec)
     _REGISTRY[spec.name] = spec
     return spec
 
@@ -467,6 +459,6 @@ def get_task(task: str | TaskSpec) -> TaskSpec:
         failed = "".join(f"; the entry point {name} could not be loaded: {why}" for name, why in _FAILED.items())
         raise InvalidInputError(
             f"task: expected one of {', '.join(known) or 'no tasks'}, got {task!r:.200}"
-            f"{did_you_mean(task, known)}; add your own with difflcs.rl.register_task{failed}"
+            f"{_checks.did_you_mean(task, known)}; add your own with difflcs.rl.register_task{failed}"
         )
     return _REGISTRY[task]

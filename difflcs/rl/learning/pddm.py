@@ -16,18 +16,9 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.cost import CostModule, GoalCost, cost_at
 from difflcs.errors import InvalidInputError
+from difflcs.rl import rollout
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.trainer import AfterStep, EpisodesReport, EpisodeTrainer
-from difflcs.rl.rollout import (
-    CONTEXT,
-    PolicyOutput,
-    action_bounds,
-    append_context,
-    has_context,
-    mpc_actions,
-    observed_transitions,
-    uniform_actions,
-)
 from difflcs.rl.seeding import Stream, generator, number
 from difflcs.rl.settings import Epochs, Rollouts, Settings, bounded, group
 
@@ -90,12 +81,12 @@ class Planner:
         u_min: Tensor | None = None,
         u_max: Tensor | None = None,
         context: Tensor | None = None,
-    ) -> PolicyOutput:
+    ) -> rollout.PolicyOutput:
         """Plan from states (B, n_x) to goals (B, n_goal); the batch must not change between two `begin`."""
         bounds = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
         low, high = (bound.float() for bound in bounds)
         batch, n_u, horizon = len(x0), len(low), self.settings.horizon
-        x0 = append_context(x0, context)
+        x0 = rollout.append_context(x0, context)
         mean = torch.zeros(batch, horizon, n_u) if self._mean is None else self._mean
         if len(mean) != batch:
             raise InvalidInputError(f"x0: expected {len(mean)} states as before, got {batch}; call begin() at a reset")
@@ -104,7 +95,7 @@ class Planner:
         # The plan one step later, its last step repeated.
         self._mean = torch.cat([planned[:, 1:], planned[:, -1:]], 1)
         # A mean of single precision may leave the bounds by its rounding: 0.1 by up to 1e-8.
-        return PolicyOutput(planned[:, 0].double().clamp(*bounds), torch.ones(batch, dtype=torch.bool))
+        return rollout.PolicyOutput(planned[:, 0].double().clamp(*bounds), torch.ones(batch, dtype=torch.bool))
 
     def _improve(self, x0: Tensor, goal: Tensor, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """The next plan (horizon, n_u) of one episode. One at a time: 700 sequences fill the cache."""
@@ -161,9 +152,9 @@ class PDDM(EpisodeTrainer):
         sizes = (settings.ensemble.networks, settings.ensemble.width)
         seed = check_positive_int("seed", seed, minimum=0)
         space: Any = env.single_observation_space
-        n_seen = cost.n_x + (space[CONTEXT].shape[0] if has_context(env) else 0)
+        n_seen = cost.n_x + (space[rollout.CONTEXT].shape[0] if rollout.has_context(env) else 0)
         self.ensemble = Ensemble(n_seen, cost.n_u, *sizes, generator(seed, Stream.FIT, 0, 0))
-        planner = Planner(self.ensemble, cost, settings, *action_bounds(env))
+        planner = Planner(self.ensemble, cost, settings, *rollout.action_bounds(env))
         super().__init__(self.ensemble, planner, seed, episode_steps, env, needed)
         self.settings, self.total_episodes = settings, total_episodes
 
@@ -175,14 +166,14 @@ class PDDM(EpisodeTrainer):
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
         if first:
-            act = uniform_actions(self.env, np.random.default_rng((self.seed, Stream.ACTION)))
+            act = rollout.uniform_actions(self.env, np.random.default_rng((self.seed, Stream.ACTION)))
         else:
-            act = mpc_actions(self.policy, seed=number(self.seed, Stream.PLAN, self.iteration, 0))
+            act = rollout.mpc_actions(self.policy, seed=number(self.seed, Stream.PLAN, self.iteration, 0))
         self.collect(act, count, after_step)
         if not settings.keep_networks:
             self.ensemble.draw(generator(self.seed, Stream.FIT, self.iteration, 0))
         loss = self.ensemble.fit(
-            *observed_transitions(self.buffer),
+            *rollout.observed_transitions(self.buffer),
             epochs=settings.ensemble.epochs.first if first else settings.ensemble.epochs.each,
             minibatch=settings.ensemble.epochs.minibatch,
             learning_rate=settings.ensemble.learning_rate,
