@@ -39,7 +39,7 @@ from difflcs.rl.learning.lcsrl import LCSRL
 from difflcs.rl.learning.model_rollouts import ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.optim import Natural, NaturalUpdate
 from difflcs.rl.learning.optim.update import Deviation
-from difflcs.rl.learning.state_tree import initialise_moments, load_moments, moments
+from difflcs.rl.learning.state_tree import StatefulAdam
 from difflcs.rl.learning.surrogate import OUTLIER_KL, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.warmup import WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import Work
@@ -160,8 +160,7 @@ class OffPolicy(Trainer):
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
         self.targets = SoftUpdate(self.loss, tau=0.01)
         critics = self.loss.qvalue_network_params.flatten_keys().values()
-        self.adam = torch.optim.AdamW(critics, 1e-3, weight_decay=1e-4)
-        initialise_moments(self.adam)
+        self.adam = StatefulAdam(critics, 1e-3, weight_decay=1e-4)
         deviation = Deviation(self.actor, 0.01, (0.9, 0.99), (0.001, 0.01))
         self.update = NaturalUpdate(self.actor, Natural(), settings.target_kl, 1.5, deviation)
 
@@ -270,7 +269,7 @@ class OffPolicy(Trainer):
             "settings": {"first_episode": self.first_episode, "first_iteration": self.first_iteration},
             "round": self.round,
             "critics": self._critics(),
-            "adam": moments(self.adam),
+            "adam": self.adam.state_dict(),
             "update": self.update.state_dict(),
             "models": self.models.state_dict(),
             "imagined": {"episodes": episodes_to_state(self.imagined)},
@@ -283,7 +282,7 @@ class OffPolicy(Trainer):
         for name, tensors in self._critics().items():
             for key, tensor in tensors.items():
                 tensor.copy_(state["critics"][name][key])
-        load_moments(self.adam, state["adam"])
+        self.adam.load_state_dict(state["adam"])
         self.update.load_state_dict(state["update"])
         self.models.load_state_dict(state["models"])
         self.imagined = episodes_from_state(state["imagined"]["episodes"])

@@ -8,7 +8,7 @@ data, any number of rows, as many in each.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import torch
@@ -153,20 +153,20 @@ def restore(part: Stateful, state: State, where: str = "checkpoint") -> None:
         raise CheckpointError(f"{where}: its values cannot be used ({error!r}); is it damaged?") from error
 
 
-def moments(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return an optimiser's tensors by the place of the parameter; its settings come from the configuration."""
-    return {str(place): dict(tensors) for place, tensors in optimiser.state_dict()["state"].items()}
+class StatefulAdam(torch.optim.AdamW):
+    """Adam whose state is its moments by the place of the parameter, at any time; settings are the configuration's."""
 
-
-def load_moments(optimiser: torch.optim.Optimizer, state: State) -> None:
-    """Go on from what `moments` gave."""
-    whole = optimiser.state_dict()
-    optimiser.load_state_dict({**whole, "state": {int(place): copy_state(tensors) for place, tensors in state.items()}})
-
-
-def initialise_moments(optimiser: torch.optim.Optimizer) -> None:
-    """Give every parameter of an Adam its moments now, so that its state has the same names at any time."""
-    for group in optimiser.param_groups:
-        for p in group["params"]:
+    def __init__(self, parameters: Iterable[Tensor], lr: float, weight_decay: float = 0.0, **options: Any):
+        super().__init__(parameters, lr, weight_decay=weight_decay, **options)
+        for p in self.param_groups[0]["params"]:
             zero = {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
-            optimiser.state[p] = {"step": torch.tensor(0.0), **zero}
+            self.state[p] = {"step": torch.tensor(0.0), **zero}
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of the optimiser, without the parameters."""
+        return {str(place): dict(tensors) for place, tensors in super().state_dict()["state"].items()}
+
+    def load_state_dict(self, state_dict: State) -> None:
+        """Go on from what `state_dict` gave."""
+        own = {int(place): copy_state(tensors) for place, tensors in state_dict.items()}
+        super().load_state_dict({**super().state_dict(), "state": own})

@@ -17,7 +17,7 @@ from torch import nn
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.checks import check_depends, check_learned
 from difflcs.rl.learning.optim.natural import DAMPING, MOMENTUM, Natural, NaturalGradient
-from difflcs.rl.learning.state_tree import State, initialise_moments, load_moments, moments
+from difflcs.rl.learning.state_tree import State, StatefulAdam
 from difflcs.rl.settings import Adam
 
 if TYPE_CHECKING:
@@ -67,10 +67,7 @@ class Deviation:
         self.log_std = actor.gaussian.log_std
         self.parameters = [p for p in (self.log_std, actor.gaussian.mixing) if p.requires_grad]
         self.learning_rate, self._limits = learning_rate, (math.log(limits[0]), math.log(limits[1]))
-        self.adam: torch.optim.Adam | None = None
-        if self.parameters:
-            self.adam = torch.optim.Adam(self.parameters, learning_rate, betas)
-            initialise_moments(self.adam)
+        self.adam = StatefulAdam(self.parameters, learning_rate, betas=betas) if self.parameters else None
 
     def step(self, scale: float) -> None:
         """Take one step."""
@@ -82,12 +79,12 @@ class Deviation:
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser, without the parameters."""
-        return {} if self.adam is None else moments(self.adam)
+        return {} if self.adam is None else self.adam.state_dict()
 
     def load_state_dict(self, state: State) -> None:
         """Go on from what `state_dict` gave."""
         if self.adam is not None:
-            load_moments(self.adam, state)
+            self.adam.load_state_dict(state)
 
 
 class UpdateRule:
@@ -124,7 +121,11 @@ class UpdateRule:
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser, without the parameters."""
-        return {"step_size": self.size.value, "optimiser": self._state(), "deviation": self.deviation.state_dict()}
+        return {
+            "step_size": self.size.value,
+            "optimiser": self.optimiser.state_dict(),
+            "deviation": self.deviation.state_dict(),
+        }
 
     def load_state_dict(self, state: State) -> None:
         """Go on from what `state_dict` gave.
@@ -137,14 +138,8 @@ class UpdateRule:
                 f"checkpoint: expected a positive step size, got {state['step_size']}; is it damaged?"
             )
         self.size.value = state["step_size"]
-        self._load(state["optimiser"])
+        self.optimiser.load_state_dict(dict(state["optimiser"]))
         self.deviation.load_state_dict(state["deviation"])
-
-    def _state(self) -> dict[str, Any]:
-        return moments(self.optimiser)
-
-    def _load(self, state: State) -> None:
-        load_moments(self.optimiser, state)
 
 
 def learned_parameters(actor: GaussianPolicy) -> list[nn.Parameter]:
@@ -169,8 +164,7 @@ class AdamUpdate(UpdateRule):
 
     def __init__(self, actor: GaussianPolicy, settings: Adam, target_kl: float, factor: float, deviation: Deviation):
         learned = learned_parameters(actor)
-        adam = torch.optim.Adam(learned, settings.learning_rate, settings.betas)
-        initialise_moments(adam)
+        adam = StatefulAdam(learned, settings.learning_rate, betas=settings.betas)
         super().__init__(learned, adam, StepSize(settings.learning_rate, target_kl, factor), deviation)
 
 
@@ -212,9 +206,3 @@ class NaturalUpdate(UpdateRule):
         chosen = torch.from_numpy(rng.permutation(len(data))[: self.samples])
         part: Any = data[chosen]
         self.optimiser.measure(self.actor.jacobian(part))
-
-    def _state(self) -> dict[str, Any]:
-        return self.optimiser.state_dict()
-
-    def _load(self, state: State) -> None:
-        self.optimiser.load_state_dict(state)
