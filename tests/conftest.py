@@ -54,6 +54,11 @@ def tensor(values: Sequence[Any] | float) -> Tensor:
     return torch.tensor(values, dtype=F64)
 
 
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal float64 numbers."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
 def contents(root: Path) -> dict[str, bytes]:
     """The files of a folder and of those in it, by their paths."""
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}

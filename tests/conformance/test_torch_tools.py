@@ -19,13 +19,9 @@ from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import Primal
 from difflcs.physics import Circle, ContactLCS, PlanarPushing
 from difflcs.scales import ScaledLCS
-from tests.conftest import refuse
+from tests.conftest import draw, refuse
 
 HORIZON, CHANGED = 3, ("A", "C", "G", "H")
-
-
-def draw(*shape, seed=0):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 DATA = X, U, NEXT, GOAL = draw(4, 4, seed=1), draw(4, 2, seed=2), draw(4, 4, seed=3), 0.3 * draw(4, 2, seed=4)

@@ -11,23 +11,14 @@ from difflcs.errors import DegenerateWarning, SolveWarning
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
-from tests.conftest import python
-
-F64 = torch.float64
+from tests.conftest import F64, python, tensor
 
 
-def matrix(*rows):
-    return torch.tensor(rows, dtype=F64)
-
-
-def one_action(R=1.0, r=0.0, B=1.0, C=0.0, E=0.0, Q=0.0):
+def one_action():
     """One state, one action, one contact that is far away."""
-    system = LCSParams(
-        A=matrix([1.0]), B=matrix([B]), C=matrix([C]), d=torch.zeros(1, dtype=F64),
-        D=matrix([0.0]), E=matrix([E]), F=matrix([1.0]), c=torch.ones(1, dtype=F64),
-    )  # fmt: skip
-    cost = QuadraticCost(matrix([Q]), matrix([R]), matrix([Q]), r=torch.tensor([r], dtype=F64))
-    return system, cost
+    one, zero, flat = tensor([[1.0]]), tensor([[0.0]]), tensor([1.0])
+    system = LCSParams(A=one, B=one, C=zero, d=0 * flat, D=zero, E=zero, F=one, c=flat)
+    return system, QuadraticCost(one, one, one)
 
 
 def test_a_residual_has_no_units(build):
@@ -43,7 +34,7 @@ def test_a_residual_has_no_units(build):
 
 
 def test_a_broken_element_has_a_large_residual():
-    system, cost = one_action(Q=1.0)
+    system, cost = one_action()
     wild = LCSParams(**{**system.tensors(), "A": 1e3 * system.A})
     with pytest.warns(SolveWarning):
         plan = LCSMPCLayer(wild, cost, 60, -1.0, 1.0, on_failure="mask")(torch.tensor([1.0], dtype=F64))
@@ -55,8 +46,8 @@ def test_a_broken_element_has_a_large_residual():
 
 @pytest.mark.parametrize("backend", ["batched", "ipopt"])
 def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradient(backend):
-    system, cost = one_action(Q=1.0)
-    B = matrix([1.0, 0.0]).requires_grad_()
+    system, cost = one_action()
+    B = tensor([[1.0, 0.0]]).requires_grad_()
     A = system.A.clone().requires_grad_()
     wider = LCSParams(**{**system.tensors(), "A": A, "B": B, "E": torch.zeros(1, 2, dtype=F64)})
     R = torch.diag(torch.tensor([1.0, 0.0], dtype=F64)).requires_grad_()
@@ -70,7 +61,7 @@ def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradien
     # The other action's gradient is that of the problem without this one.
     alone = A.detach().clone().requires_grad_()
     system = LCSParams(**{**system.tensors(), "A": alone})
-    single = QuadraticCost(cost.Q, matrix([1.0]), cost.Q_final)
+    single = QuadraticCost(cost.Q, tensor([[1.0]]), cost.Q_final)
     LCSMPCLayer(system, single, 3, -1.0, 1.0)(torch.tensor([[0.5], [-0.3]], dtype=F64)).u.square().sum().backward()
     torch.testing.assert_close(A.grad, alone.grad, rtol=1e-6, atol=1e-9)
 

@@ -14,7 +14,7 @@ from difflcs.rl.learning.advantages import MultiActionAdvantages, RewardScale, m
 from difflcs.rl.learning.critic import Critic, returns
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
-from tests.conftest import refuse
+from tests.conftest import Build, draw, refuse
 
 STEPS = 6
 
@@ -59,17 +59,13 @@ def test_rewards_that_are_not_finite_are_refused(bad):
     refuse(InvalidInputError, "finite rewards", RewardScale(3.0, 10.0, 0.1), rewards, torch.ones(2, dtype=torch.bool))
 
 
-def make_critic(gamma: float = 0.9, zeta: float = 0.8) -> Critic:
-    return Critic(CriticSettings(), 3, STEPS, gamma, zeta, (0, 5))
-
-
-def some(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def make_critic(gamma: float = 0.9) -> Critic:
+    return Critic(CriticSettings(), 3, STEPS, gamma, 0.8, (0, 5))
 
 
 def test_advantages_are_the_papers(monkeypatch):
     """Eq. 5 written out, with a value of zero at the end of an episode."""
-    critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
+    critic, inputs, rewards = make_critic(), draw(5, STEPS + 1, 3), draw(5, STEPS, seed=1)
     value = critic.network(inputs.float()).detach().double().squeeze(-1)
     value[:, -1] = 0
     delta = rewards + 0.9 * value[:, 1:] - value[:, :-1]
@@ -88,13 +84,11 @@ def test_advantages_are_the_papers(monkeypatch):
     torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
 
 
-def gaussian(*shape: int, n_u: int = 3, seed: int = 0) -> TensorDict:
+def gaussian(*shape: int) -> TensorDict:
     """Samples of a Gaussian with a full covariance."""
-    generator = torch.Generator().manual_seed(seed)
-    mean = torch.randn(*shape, n_u, generator=generator, dtype=torch.float64)
-    factor = torch.randn(n_u, n_u, generator=generator, dtype=torch.float64).tril(-1) + 0.5 * torch.eye(n_u)
-    noise = torch.randn(*shape, n_u, generator=generator, dtype=torch.float64)
-    taken = {"action": mean + noise @ factor.mT, "loc": mean, "scale_tril": factor.expand(*shape, -1, -1)}
+    n = Build.normal(0)
+    mean, factor = n(*shape, 3), n(3, 3).tril(-1) + 0.5 * torch.eye(3)
+    taken = {"action": mean + n(*shape, 3) @ factor.mT, "loc": mean, "scale_tril": factor.expand(*shape, -1, -1)}
     return TensorDict(taken, shape)
 
 
@@ -149,11 +143,11 @@ def inputs_of(state, goal, elapsed):
 
 def judged(actions: int = 4, zeta: float = 0.0, gamma: float = 0.9):
     """Episodes played in the world, the estimator, and its estimate."""
-    count, state = 10, some(10, 1)
-    goal, steps, states = 0.3 * some(count, 1, seed=3), [], [state]
+    count, state = 10, draw(10, 1)
+    goal, steps, states = 0.3 * draw(count, 1, seed=3), [], [state]
     for t in range(STEPS):
         step = TensorDict({"loc": -0.3 * state, "scale_tril": torch.full((count, 1, 1), 0.4).double()}, [count])
-        step["action"] = step["loc"] + 0.4 * some(count, 1, seed=10 + t)
+        step["action"] = step["loc"] + 0.4 * draw(count, 1, seed=10 + t)
         step["action_log_prob"] = torch.zeros(count).double()
         state = state + step["action"].clamp(-BOUND, BOUND)
         steps.append(step)

@@ -105,21 +105,15 @@ CORRUPTIONS = {
 }
 
 
-@pytest.mark.parametrize("corrupt", CORRUPTIONS.values(), ids=CORRUPTIONS.keys())
-def test_corrupt_checkpoints_are_refused_and_untouched(tmp_path, corrupt):
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_corrupt_checkpoints_are_refused_and_untouched_and_the_older_one_is_named(tmp_path, name):
     for iteration in (1, 2):
         save(tmp_path, iteration)
-    corrupt(tmp_path)
+    CORRUPTIONS[name](tmp_path)
     before = contents(tmp_path)
-    refuse(CheckpointError, r"expected|match", load_checkpoint, tmp_path)
+    message = refuse(CheckpointError, r"expected|match", load_checkpoint, tmp_path)
+    assert "000001" in message or name in ("no latest", "latest is no JSON")
     assert contents(tmp_path) == before
-
-
-def test_a_corrupt_checkpoint_names_the_older_one(tmp_path):
-    for iteration in (1, 2):
-        save(tmp_path, iteration)
-    _flip(tmp_path / "000002/model.safetensors")
-    refuse(CheckpointError, "000001", load_checkpoint, tmp_path)
 
 
 def test_run_directory_refuses_what_is_there(tmp_path):

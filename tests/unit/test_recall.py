@@ -13,7 +13,7 @@ from difflcs._linalg import product
 from difflcs.errors import BoundsError, DTypeError, NonFiniteError, NotPositiveDefiniteError, ShapeError
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import BatchedBackend
-from tests.conftest import refuse
+from tests.conftest import draw, refuse
 
 HORIZON = 4
 
@@ -30,10 +30,6 @@ def make_layer(model=None, cost=None, **kwargs):
     half = torch.full((2,), 0.5).double()
     limits = {} if "bounds" in kwargs else {"u_min": -half, "u_max": half}
     return LCSMPCLayer(make_model() if model is None else model, cost or make_cost(), HORIZON, **limits, **kwargs)
-
-
-def draw(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 X, GOAL = 0.3 * draw(1, 4, seed=1), 0.3 * draw(1, 2, seed=2)

@@ -8,7 +8,7 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position
-from tests.conftest import refuse
+from tests.conftest import refuse, tensor
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>
@@ -27,24 +27,20 @@ ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom type="caps
   <actuator><position joint="a" kp="100"/><position joint="b" kp="100"/></actuator></mujoco>"""
 
 
-def vector(*values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def execute(module, model, plan, steps):
     """Where the plan's actions lead in MuJoCo, without looking again: (qpos, qvel)."""
     data = mujoco.MjData(model)
     for x, u in zip(plan.x[:-1], plan.u, strict=True):
         data.ctrl[:] = module.control(x, u).numpy()
         mujoco.mj_step(model, data, steps)
-    return vector(*data.qpos, *data.qvel)
+    return tensor([*data.qpos, *data.qvel])
 
 
 def pushing():
     system = PlanarPushing(box(-0.05, 0.05, -0.05, 0.05), 0.01, friction=0.3, drive=PositionDrive())
     cost = GoalCost.reach(5, 2, goal_weight=(400.0, 400.0, 1.0), input_weight=4.0)
-    x = vector(0, 0, 0, -0.065, 0.02), vector(0, 0, 0.3, -0.08, 0.0)
-    return system, cost, torch.stack(x), vector(0.04, 0.01, 0.5)
+    x = tensor([0, 0, 0, -0.065, 0.02]), tensor([0, 0, 0.3, -0.08, 0.0])
+    return system, cost, torch.stack(x), tensor([0.04, 0.01, 0.5])
 
 
 def test_a_sequence_moves_as_the_module_asked_anew_at_each_step():
@@ -67,7 +63,7 @@ def test_a_door_is_pushed_as_far_as_several_passes_say(passes, wrong):
     cost = GoalCost.reach(3, 2, goal_weight=(10.0,), goal_weight_final=(100.0,), input_weight=20.0)
     mpc = LCSMPCLayer(module, cost, 10, -0.05, 0.05, passes=passes)
     for goal in (0.6, 1.4):
-        plan = mpc(torch.zeros(3, dtype=torch.float64), vector(goal))
+        plan = mpc(torch.zeros(3, dtype=torch.float64), tensor([goal]))
         assert plan.x[-1, 0] == pytest.approx(goal, abs=0.01)
         error = abs(float(execute(module, model, plan, 50)[0]) - goal)
         assert error > wrong if passes == 1 else error < wrong
@@ -77,8 +73,8 @@ def test_a_door_is_pushed_as_far_as_several_passes_say(passes, wrong):
 def test_a_pendulum_is_turned_upright_in_several_passes(passes, wrong):
     """Gravity turns back on the way up, and one system has it as it hangs."""
     module = MujocoLCS(model := mujoco.MjModel.from_xml_string(PENDULUM), motion="dynamic", seconds=0.05)
-    goal = vector(torch.pi, 0.0)
-    Q, Q_final = torch.diag(vector(0.1, 0.01)), torch.diag(vector(200.0, 20.0))
+    goal = tensor([torch.pi, 0.0])
+    Q, Q_final = torch.diag(tensor([0.1, 0.01])), torch.diag(tensor([200.0, 20.0]))
     cost = QuadraticCost(Q, 0.05 * torch.eye(1, dtype=torch.float64), Q_final, q=-Q @ goal, q_final=-Q_final @ goal)
     plan = LCSMPCLayer(module, cost, 20, -4.1, 4.1, passes=passes)(torch.zeros(2, dtype=torch.float64))
     error = float((execute(module, model, plan, 10) - goal).abs().max())
@@ -93,7 +89,8 @@ def test_a_pendulum_is_turned_upright_in_several_passes(passes, wrong):
 @pytest.mark.parametrize("constant", [False, True])
 def test_an_arm_reaches_as_far_as_a_cost_along_the_plan_says(constant):
     """Where the tip is depends on the joints through sines, of which one pass knows the tangents at the beginning."""
-    module, x, goal = MujocoLCS(model := mujoco.MjModel.from_xml_string(ARM)), vector(0.1, 0.2), vector(0.2, 0.0, -0.35)
+    module = MujocoLCS(model := mujoco.MjModel.from_xml_string(ARM))
+    x, goal = tensor([0.1, 0.2]), tensor([0.2, 0.0, -0.35])
     cost, errors = MujocoCost(module, [Position("tip", weight=0.1, weight_final=100.0), Effort(0.1)]), []
     for passes in (1, 8):
         mpc = LCSMPCLayer(module.params(x) if constant else module, cost, 6, -0.4, 0.4, passes=passes)
@@ -102,7 +99,7 @@ def test_an_arm_reaches_as_far_as_a_cost_along_the_plan_says(constant):
         for state in plan.x[1]:
             data.qpos[:] = state.numpy()
             mujoco.mj_forward(model, data)
-            away.append((vector(*data.site("tip").xpos) - goal).square().sum())
+            away.append((tensor([*data.site("tip").xpos]) - goal).square().sum())
         errors.append(float(away[-1].sqrt()))
     assert errors[0] > 0.2  # m
     assert errors[1] < 0.002
@@ -138,7 +135,7 @@ class Drift:
 
 def test_a_context_holds_for_all_stages():
     cost = GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=1.0)
-    plan = LCSMPCLayer(Drift(), cost, 3, passes=3)(vector(0.0), vector(0.0), context=vector(0.5))
+    plan = LCSMPCLayer(Drift(), cost, 3, passes=3)(tensor([0.0]), tensor([0.0]), context=tensor([0.5]))
     torch.testing.assert_close(plan.x[1:] - plan.x[:-1], plan.u + 0.5)
 
 
@@ -148,4 +145,4 @@ def test_refuses_what_passes_cannot_do():
     refuse(InvalidInputError, "passes=1", LCSMPCLayer(Drift(), cost, 3, passes=2).controller)
     staged = Drift(lambda system: LCSSequence.stack([system] * 3))
     with pytest.raises(DTypeError, match="expected LCSParams from Drift"):
-        LCSMPCLayer(staged, cost, 3, passes=2)(vector(0.0), vector(0.0), context=vector(0.5))
+        LCSMPCLayer(staged, cost, 3, passes=2)(tensor([0.0]), tensor([0.0]), context=tensor([0.5]))
