@@ -22,7 +22,7 @@ import torch
 
 from difflcs import LCSModel, __main__, _storage, cli
 from difflcs.cli import train as cli_train
-from difflcs.rl import get_task, task_names
+from difflcs.rl import get_task, register_task
 from difflcs.rl.methods import LCSRLMethod, ViolationMethod, get_method, method_names
 from difflcs.rl.runs import progress
 from difflcs.rl.runs.checkpoint import RunDirectory
@@ -51,10 +51,7 @@ def fails(capsys, *arguments) -> str:
 @pytest.fixture(scope="module", autouse=True)
 def _small_pictures(registries):
     """Films of a sixteenth of the pixels, which software draws."""
-    small = replace(get_task("cube"), picture={"width": 160, "height": 120})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("difflcs.rl.tasks._REGISTRY", {name: get_task(name) for name in task_names()} | {"cube": small})
-        yield
+    register_task(replace(get_task("cube"), picture={"width": 160, "height": 120}))
 
 
 @pytest.fixture(scope="module")

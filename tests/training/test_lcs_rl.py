@@ -8,17 +8,17 @@ from difflcs.rl.learning.state_tree import copy_state
 from tests.training import slide
 
 
-def make_lcsrl(seed: int = 0, models: bool = False, **changes) -> LCSRL:
+def make_lcsrl(models: bool = False, **changes) -> LCSRL:
     lcs = slide.make_model()
     mpc = slide.make_mpc(lcs)
     settings = WarmupSettings(rollouts=Rollouts(first=2, each=3), noise=0.02, epochs=Epochs(3, 2, 8))
-    warmup, envs = Warmup(lcs, mpc, slide.make_envs(3), settings, seed, slide.STEPS), slide.make_envs()
+    warmup, envs = Warmup(lcs, mpc, slide.make_envs(3), settings, 0, slide.STEPS), slide.make_envs()
 
     def make_main(first_episode: int, first_iteration: int) -> PPO:
         options = {"first_episode": first_episode, "first_iteration": first_iteration}
         options["total_episodes"] = 8 + 2 * slide.ROLLOUTS
-        rollouts = slide.make_models(seed, 2, iterations=1, rollouts=5) if models else None
-        return slide.make_ppo(seed, env=envs, models=rollouts, controller=mpc, options=options, **changes)
+        rollouts = slide.make_models(0, 2, iterations=1, rollouts=5) if models else None
+        return slide.make_ppo(0, env=envs, models=rollouts, controller=mpc, options=options, **changes)
 
     return LCSRL(warmup, 8 * slide.STEPS, make_main)
 

@@ -23,9 +23,8 @@ def make_cost() -> GoalCost:
     return GoalCost.reach(1, 1, goal_weight=(200.0,), input_weight=0.01)
 
 
-def make_pddm(seed: int = 0, total: int = 25, env=None, **changes) -> PDDM:
-    env = make_envs(10) if env is None else env
-    return PDDM(make_cost(), env, replace(SMALL, **changes), seed, total_episodes=total, episode_steps=STEPS)
+def make_pddm(total: int = 25, **changes) -> PDDM:
+    return PDDM(make_cost(), make_envs(10), replace(SMALL, **changes), 0, total_episodes=total, episode_steps=STEPS)
 
 
 def test_pddm_learns_to_reach():

@@ -14,7 +14,7 @@ from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, regis
 from difflcs.cli.bench import pushing_model, states_and_goals
 from difflcs.errors import DTypeError
 from difflcs.mpc import kkt
-from difflcs.mpc.backends import Backend, IpoptBackend, base, ipopt
+from difflcs.mpc.backends import Backend, IpoptBackend, ipopt
 from difflcs.systems import pushing_cost
 from tests.conformance.varied.generators import random_case
 from tests.conftest import python, refuse
@@ -162,12 +162,6 @@ def test_the_better_of_two_starts_is_kept():
 # --- registry -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def registry(monkeypatch):
-    monkeypatch.setattr(base, "REGISTRY", dict(base.REGISTRY))
-
-
-@pytest.mark.usefixtures("registry")
 def test_a_backend_whose_package_is_missing_gives_the_pip_line(build):
     @dataclass(frozen=True)
     class Absent(Backend):

@@ -10,11 +10,6 @@ from difflcs.errors import CheckpointError, InvalidInputError, ShapeError
 from tests.conftest import refuse
 
 
-@pytest.fixture
-def model(build):
-    return build.model(seed=3)
-
-
 def test_a_new_model_has_the_documented_start():
     model = LCSModel(9, 6, 5, stiffness=0.1, init_scale=1e-3)
     assert {k: tuple(v.shape) for k, v in model.named_parameters()} == {

@@ -10,8 +10,8 @@ from tests.training.slide import STEPS, U_MAX, features
 BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
 
 
-def make_network(width: int = 16, seed: int = 0) -> MLPController:
-    return MLPController(features, 3, -BOUND, BOUND, width, STEPS, torch.Generator().manual_seed(seed))
+def make_network() -> MLPController:
+    return MLPController(features, 3, -BOUND, BOUND, 16, STEPS, torch.Generator().manual_seed(0))
 
 
 def test_actions_stay_within_the_bounds_and_depend_on_the_time():
