@@ -263,11 +263,13 @@ def assemble_lcs(
     rows, normals = rows / length, normals / length
     F = rows @ C
     n_lam = F.shape[-1]
-    diagonal = torch.diag_embed(softness) if of is torch else softness[..., None] * np.eye(n_lam)
-    F = 0.5 * (F + F.swapaxes(-1, -2)) + diagonal
+    F, forces = 0.5 * (F + F.swapaxes(-1, -2)), np.arange(n_lam)
+    if of is torch:
+        F = F + torch.diag_embed(softness)
+    else:
+        F[..., forces, forces] += softness
     D = rows @ free.A - (rows - normals)
     c = gap / length + _apply(rows, free.d) - _apply(normals, x)
-    forces = np.arange(n_lam)
     if stewart_trinkle:
         forces += np.minimum(forces // each, n_contacts)
     c = c if rest is None else c - softness * rest[..., forces] / force

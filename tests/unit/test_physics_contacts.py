@@ -10,7 +10,7 @@ import torch
 
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco import Distance, MujocoCost, MujocoLCS
-from difflcs.physics.mujoco.nominal import solve_soft
+from difflcs.physics.mujoco.nominal import solve_forces
 from tests.conftest import refuse
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
@@ -123,7 +123,9 @@ def test_soft_forces_are_clipped_by_their_bounds(m, nv):
     factor[:, nv // 2] = 0.0
     response, high = factor @ factor.swapaxes(-1, -2), random.uniform(0, 3, (50, m))
     for low, most in ((0 * high, np.full_like(high, np.inf)), (-high, high)):
-        force = solve_soft(rows, response, gap, 1e-3, low, most)
+        F = rows @ response @ rows.swapaxes(-1, -2) + 1e-3 * np.eye(m)
+        force, found = solve_forces(F, gap, low, most, np.zeros_like(gap), 1e-3)
+        assert found.all()
         slack = gap + np.einsum("nmi,nij,nkj,nk->nm", rows, response, rows, force)
         np.testing.assert_allclose(force, np.clip(-slack / 1e-3, low, most), rtol=0, atol=1e-7 * np.abs(force).max())
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from difflcs._checks import check_positive_int
 from difflcs.physics.complementarity import count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, count_points, find_moving
+from difflcs.physics.mujoco.correction import predict
 from difflcs.physics.mujoco.limits import give_way
 from difflcs.physics.mujoco.readings import Readings
-from difflcs.records import LCSParams, advance
+from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
 _MOST = 1.5  # times the load at the nominal action, up to which friction grows
@@ -86,7 +87,7 @@ class Caps:
             return system
         n, rays = len(read.x), count_forces(len(self._rough), read.dof_contacts.tangent.shape[2])
         x, u = (torch.from_numpy(read.batched(v)) for v in (read.x, read.moved.nominal))
-        lam = advance(system, x, u).lam.reshape(n, system.n_lam).numpy()
+        lam = predict(system, x, u).lam.reshape(n, system.n_lam).numpy()
         loads = lam[:, :rays].reshape(n, len(self._rough), -1).sum(-1)
         loads[:, : self.count] += lam[:, rays : rays + self.count]
         c = system.c.clone()

@@ -20,12 +20,14 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_shape, check_tensor
 from difflcs.errors import ContactWarning, InvalidInputError, warn
+from difflcs.lcp import solve_lcp
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import Rows
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
 from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.nominal import solve_forces
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams, advance
+from difflcs.records import LCSParams, LCSPrediction
 
 Array = NDArray[np.float64]
 _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
@@ -103,8 +105,26 @@ class WholeStep:
         return torch.stack(found, -2)
 
 
+def predict(system: LCSParams, x: Tensor, u: Tensor, acts: NDArray[np.bool_] | None = None) -> LCSPrediction:
+    """Advance systems by one step, like `difflcs.records.advance`, by the active sets of their forces.
+
+    The first forces of each are likely those that `acts` (..., k) says.
+    """
+    gap = system.gap(x, u)
+    n, m = gap.shape[:-1].numel(), gap.shape[-1]
+    q, F = gap.reshape(n, m).numpy(), system.F.reshape(system.F.shape[:-2].numel(), m, m).numpy()
+    start = np.maximum(-q, 0.0)
+    if acts is not None:
+        start[:, acts.shape[-1] :], start[:, : acts.shape[-1]] = 0.0, acts.reshape(n, acts.shape[-1])
+    lam, found = solve_forces(F, q, np.zeros_like(q), np.full_like(q, np.inf), start)
+    if (more := np.flatnonzero(~found)).size:
+        lam[more] = solve_lcp(torch.from_numpy(F[more % len(F)]), torch.from_numpy(q[more])).lam.numpy()
+    lam = torch.from_numpy(lam).reshape(gap.shape)
+    return LCSPrediction(system.next_state(x, u, lam), lam)
+
+
 def correct(
-    system: LCSParams, step: DynamicStep, after: Array, tangent: Any, bound: Array, rows: Rows, hard: Any, servos: int
+    system: LCSParams, step: DynamicStep, after: Array, tangent: Any, bound: Array, rows: Rows, hard: Any, acts: Any
 ) -> tuple[LCSParams, NDArray[np.bool_]]:
     """Correct C and d of systems at n states; return them, and those (n,) where more is corrected than moves.
 
@@ -116,12 +136,13 @@ def correct(
         bound: (n, n_bounded) of dry friction, the forces after those of limits.
         rows: limits and dry friction.
         hard: (n, k) of the k forces of contacts, which are the first; False for those of soft contacts.
-        servos: how many have limits of their force, two multipliers each.
+        acts: (..., k) True for forces that are likely not zero; those of the limits of servos come after them.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
-    found = advance(system, *(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
+    at = (torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle))
+    found = predict(system, *at, acts=acts)
     C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]).numpy() for v in (system.C, system.d, *found))
-    C, of_servos = np.split(C, [C.shape[2] - 2 * servos], 2)
+    C, of_servos = C[:, :, : acts.shape[-1]], C[:, :, acts.shape[-1] :]
     lam = lam[:, : C.shape[2]]
     n_bounded, lower = bound.shape[1], np.zeros_like(lam)
     n_contacts, n_limits = hard.shape[1], rows.gap.shape[1] - n_bounded

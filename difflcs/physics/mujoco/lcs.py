@@ -19,7 +19,7 @@ from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, assemble
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
-from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
+from difflcs.physics.mujoco.correction import WholeStep, correct, predict, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
@@ -32,7 +32,7 @@ from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.readings import Readings
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
+from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
 _BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
@@ -269,7 +269,7 @@ class MujocoLCS:
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = read.tangent, rows.bound / unit, found, hard, len(self._servos.those)
+            more = read.tangent, rows.bound / unit, found, hard, rest != 0
             system, read.doubtful[:] = correct(system, step, read.after, *more)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -379,7 +379,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     unstable, ways = np.tile(read.moved.unstable[some], m), (True, False) if of._motion.loosens else (True,)
     free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
     flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-    predicted = advance(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
+    predicted = predict(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
     at, to, alone = (v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
     bodies = read.moved.inverse_mass[some], of._motion.in_tree, of._model
     warn_of_wrong(at[0], to[0], alone, step.velocity[some], *bodies)

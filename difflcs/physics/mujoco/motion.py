@@ -46,7 +46,7 @@ _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and lat
     for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 )
 _HINGE, _FAR = int(mujoco.mjtJoint.mjJNT_HINGE), 0.5  # turn of it in a step [rad], in which what drives do changes
-_DIFFERENCE = 1e-4  # in parts of the size of actions
+_DIFFERENCE = 1e-6, 1e-4  # in parts of the size of actions; with equality constraints, which are solved less exactly
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
 
@@ -195,9 +195,9 @@ class Dynamic:
         for i in those:
             some = np.full_like(fast, True) if i in curved else fast
             low, high = self.actuators.range[:, i, None] - ctrl[some, i]
-            size = _DIFFERENCE * self.actuators.reach[i]
-            near = [np.maximum(low, -size), np.minimum(high, size)]
-            ends = np.stack([0.5 * low, 0.5 * high, low, high] if i in curved else near)
+            size = _DIFFERENCE[bool(self.model.neq)] * self.actuators.reach[i]
+            near = np.where(high > -low, np.minimum(high, size), np.maximum(low, -size))
+            ends = np.stack([0.5 * low, 0.5 * high, low, high] if i in curved else [near])
             secants[some, :, i] = 0.0
             for end in ends:
                 other = ctrl[some]
@@ -360,7 +360,7 @@ class Dynamic:
                 response = np.linalg.solve(np.eye(nv) + 0.5 * response @ (turns.swapaxes(-1, -2) - turns), response)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
             else:
-                one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ rates)
+                one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass) @ rates
             one[:, :nv] += h * one[:, nv : 2 * nv]
             one[:, 2 * nv : n_x] += activation
         with np.errstate(over="ignore", invalid="ignore"):

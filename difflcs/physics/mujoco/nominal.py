@@ -150,18 +150,32 @@ class _Rays:
         self.shape = n, k, max(1, 2 * slide.shape[2])
         self._kept = np.flatnonzero(rough[:, None] | (np.arange(self.shape[2]) == 0))  # one where all are the same
         self._rows = np.concatenate([rays.reshape(n, k * self.shape[2], rays.shape[-1])[:, self._kept], rows.normal], 1)
-        self._response, self._give, self._compliance, self._of_rows = response / give, give, compliance, rows.gap
+        self._gives = (response / give) @ self._rows.swapaxes(-1, -2)
+        self._F, forces = self._rows @ self._gives, np.arange(self._rows.shape[1])
+        self._F[:, forces, forces] += compliance
+        self._give, self._compliance, self._of_rows = give, compliance, rows.gap
         unbounded = np.full((n, self._rows.shape[1] - rows.bound.shape[1]), np.inf)
         self._low = np.concatenate([np.zeros_like(unbounded), -give * rows.bound], 1)
         self._high = np.concatenate([unbounded, give * rows.bound], 1)
 
     def forces(self, place: Array, gap: Array, rest: Array | float = 0.0) -> tuple[Array, Array]:
-        """Forces (n, m) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`."""
+        """Forces (n, m) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`.
+
+        Warns:
+            ContactWarning: for some states rounding keeps it from finding them exactly.
+        """
         apart = np.concatenate([gap[:, self._kept // self.shape[2]], self._of_rows], 1)
-        apart = apart + (self._rows @ place[:, :, None])[:, :, 0] - self._compliance * self._give * rest
-        lam = solve_soft(self._rows, self._response, apart, self._compliance, self._low, self._high)
-        moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
-        return lam / self._give, place + moved[:, :, 0]
+        start = np.zeros_like(apart) + rest * self._give
+        apart = apart + (self._rows @ place[:, :, None])[:, :, 0] - self._compliance * start
+        lam, found = solve_forces(self._F, apart, self._low, self._high, start, self._compliance)
+        if missed := int((~found).sum()):
+            warn(
+                f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} "
+                f"of {len(gap)} states, so that what touches there may creep: look for bodies of very different mass, "
+                f"or pass a larger compliance",
+                ContactWarning,
+            )
+        return lam / self._give, place + (self._gives @ lam[:, :, None])[:, :, 0]
 
     def impulse(self, forces: Array, rows: ScaledRows) -> Array:
         """Impulse (n, nv, 1) on the degrees of freedom by forces (n, m)."""
@@ -175,35 +189,21 @@ class _Rays:
         return of_contacts.reshape(self.shape), forces[:, len(self._kept) :]
 
 
-def solve_soft(rows: Array, response: Array, gap: Array, compliance: float, low: Array, high: Array) -> Array:
-    """Compute forces λ = clip(−(gap + rows · z)/compliance, low, high), with z = response rowsᵀ λ.
+def solve_forces(
+    F: Array, q: Array, low: Array, high: Array, start: Array, compliance: float = 0.0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Find λ (n, m) between bounds where q + F λ (n, m) is zero within them, and else presses λ against them.
 
-    So 0 ≤ λ ⊥ gap + rows · z + compliance · λ ≥ 0 between 0 and infinity; between −b and b it is dry friction.
-
-    Args:
-        rows: (n, m, nv).
-        response: (n, nv, nv) motion by forces, symmetric and positive semidefinite.
-        gap: (n, m).
-        compliance: > 0.
-        low: (n, m) least forces.
-        high: (n, m) largest forces.
-
-    Warns:
-        ContactWarning: for some states rounding keeps it from finding them exactly.
+    So 0 ≤ λ ⊥ q + F λ ≥ 0 between 0 and infinity; between −b and b it is dry friction. Return λ, and a mask (n,) of
+    those that were found. The matrices F (k, m, m) are taken in turn. With a compliance, which F has on its diagonal,
+    it is symmetric. Within their bounds are probably those that are so in `start`.
     """
-    force = np.empty_like(gap)
-    rows, gap, low, high = (np.ascontiguousarray(values) for values in (rows, gap, low, high))
-    response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
-    threads = max(1, min(len(gap), torch.get_num_threads()))
-    missed = _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
-    if missed:
-        warn(
-            f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} of "
-            f"{len(gap)} states, so that what touches there may creep: look for bodies of very different mass, or pass "
-            f"a larger compliance",
-            ContactWarning,
-        )
-    return force
+    lam, found = np.array(start, dtype=np.float64, order="C"), np.zeros(len(q), dtype=bool)
+    if q.size:
+        threads = max(1, min(len(q), torch.get_num_threads()))
+        F, q, low, high = (np.ascontiguousarray(values) for values in (F, q, low, high))
+        _mujoco.solve_forces(compliance, threads, F, q, low, high, lam, found)
+    return lam, found | (not q.size)
 
 
 def _settle(at: Situation, at_once: NDArray[np.bool_]) -> tuple[ScaledRows, Array]:
@@ -332,15 +332,12 @@ def _find_closing(place: Array, response: Array, contacts: MujocoContacts, held:
     """
     if held.any():
         place = place + _push(response, held, held, -held @ place[:, :, None])[:, :, 0]
-
-    def gap(place: Array) -> Array:
-        return contacts.gap + np.einsum("nkv,nv->nk", contacts.normal, place)
-
-    closing = gap(place) < 0
+    gap = contacts.gap + (contacts.normal @ place[:, :, None])[:, :, 0]
+    closing = gap < 0
     for _ in range(closing.shape[1] * int(closing.any())):
         rows = np.concatenate([contacts.normal * closing[:, :, None], held], 1)
-        by = np.concatenate([np.where(closing, -gap(place), 0.0), np.zeros(held.shape[:2])], 1)
-        more = closing | (gap(place + _push(response, rows, rows, by[:, :, None])[:, :, 0]) < 0)
+        by = np.concatenate([np.where(closing, -gap, 0.0), np.zeros(held.shape[:2])], 1)
+        more = closing | (gap + (contacts.normal @ _push(response, rows, rows, by[:, :, None]))[:, :, 0] < 0)
         if (more == closing).all():
             break
         closing = more
@@ -372,11 +369,9 @@ def _compute_carried(
     normals = contacts.normal * (closing | (contacts.gap < 0))[:, :, None]
     forces = normals - _compute_drag(step, contacts, slide) * closing[:, :, None] if slides.any() else normals
     rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), step.motion) for v in (normals, forces))
-    some = rows.any((0, 2))
-    rows, forces = rows[:, some], forces[:, some]
-    delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)
-    pushed = _push(step.response, rows, forces, rows @ delayed)
-    return np.concatenate(np.split(pushed, 2, -1), 1)
+    # As far along the rows as what is delayed.
+    pushed = _push(step.response, rows, forces, rows)[:, None] @ step.delayed.reshape(len(rows), 2, nv, -1)
+    return pushed.reshape(step.delayed.shape)
 
 
 def _compute_drag(step: DynamicStep, contacts: MujocoContacts, slide: Array) -> Array:
@@ -403,16 +398,10 @@ def _split_by_body(rows: Array, motion: Dynamic) -> Array:
 
 def _push(response: Array, rows: Array, forces: Array, by: Array) -> Array:
     """Motion ζ (n, nv, m) when forces along `forces` (n, k, nv) move it along `rows` (n, k, nv) by (n, k, m)."""
-    if not rows.size:
-        return np.zeros((len(rows), rows.shape[-1], by.shape[-1]))
-    gives = response @ forces.swapaxes(-1, -2)
-    inner = rows @ gives
-    # Contacts of one face are not independent.
-    scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
-    inner += np.eye(inner.shape[-1]) * np.where(scale > 0, 1e-9 * scale, 1.0)
-    if by.shape[-1] < gives.shape[1]:
-        return gives @ np.linalg.solve(inner, by)
-    return np.linalg.solve(inner.swapaxes(-1, -2), gives.swapaxes(-1, -2)).swapaxes(-1, -2) @ by
+    moved = np.empty((len(rows), rows.shape[2], by.shape[2]))
+    response, rows, forces, by = (np.ascontiguousarray(values) for values in (response, rows, forces, by))
+    _mujoco.push(response, rows, forces, by, moved)
+    return moved
 
 
 def _turn_tangents(tangent: Array, slide: Array) -> Array:

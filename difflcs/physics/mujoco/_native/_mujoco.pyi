@@ -66,13 +66,14 @@ def simulate(
     ctrl: np.ndarray,
     after: np.ndarray,
 ) -> tuple[int, int, str]: ...
-def solve_soft(
-    J: np.ndarray,
-    R: np.ndarray,
+def solve_forces(
+    c: float,
+    threads: int,
+    F: np.ndarray,
     q: np.ndarray,
-    compliance: float,
     low: np.ndarray,
     high: np.ndarray,
-    threads: int,
-    force: np.ndarray,
-) -> int: ...
+    lam: np.ndarray,
+    found: np.ndarray,
+) -> None: ...
+def push(R: np.ndarray, rows: np.ndarray, forces: np.ndarray, by: np.ndarray, moved: np.ndarray) -> None: ...

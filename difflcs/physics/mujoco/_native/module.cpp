@@ -13,8 +13,8 @@
 #include <thread>
 
 #include "finder.hpp"
+#include "forces.hpp"
 #include "motion.hpp"
-#include "soft.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -277,23 +277,30 @@ Outcome simulate(const Library& library, const Motion& motion, const std::vector
   });
 }
 
-// Forces (n, m) between bounds on the rows J (n, m, nv), where R (n, nv, nv) is the motion by forces. Returns how many
-// problems are not solved.
-int64_t solve_soft(Array<const double> J, Array<const double> R, Array<const double> q, double compliance,
-                   Array<const double> low, Array<const double> high, int threads, Array<double> force) {
-  const size_t n = J.shape(0), m = J.shape(1), nv = J.shape(2);
-  check(R.size() == n * nv * nv && q.size() == n * m && low.size() == n * m && high.size() == n * m &&
-        force.size() == n * m && threads > 0);
-  std::vector<SoftForces> solvers;
-  for (int t = 0; t < threads; t++) solvers.emplace_back(static_cast<int>(m), static_cast<int>(nv));
-  std::atomic<int64_t> missed{0};
+// Forces λ (n, m) between bounds for q (n, m) and F (k, m, m), taken in turn; `found` (n) says which. F is symmetric with
+// a compliance c on its diagonal, or c is zero.
+void solve_forces(double c, int threads, Array<const double> F, Array<const double> q, Array<const double> low,
+                  Array<const double> high, Array<double> lam, Array<bool> found) {
+  const size_t n = q.shape(0), m = q.shape(1), k = F.shape(0);
+  check(F.size() == k * m * m && (k > 0 || n == 0) && lam.size() == n * m && found.size() == n && threads > 0 &&
+        low.size() == n * m && high.size() == n * m);
+  std::vector<ActiveSet> solvers(threads);
   on_threads(threads, n, [&](size_t thread, int64_t i) {
-    const bool found = solvers[thread].solve(J.data() + i * m * nv, R.data() + i * nv * nv, q.data() + i * m,
-                                             compliance, low.data() + i * m, high.data() + i * m, force.data() + i * m);
-    missed += !found;
+    found.data()[i] = solvers[thread].solve(F.data() + i % k * m * m, q.data() + i * m, low.data() + i * m,
+                                            high.data() + i * m, c, static_cast<int>(m), lam.data() + i * m);
     return true;
   });
-  return missed;
+}
+
+// Motion (n, nv, m) by which rows (n, k, nv) move by (n, k, m), by forces along others, with responses R (n, nv, nv).
+void push(Array<const double> R, Array<const double> rows, Array<const double> forces, Array<const double> by,
+          Array<double> moved) {
+  const int64_t n = rows.shape(0), k = rows.shape(1), nv = rows.shape(2), m = by.shape(2);
+  check(R.size() == size_t(n * nv * nv) && forces.size() == rows.size() && by.size() == size_t(n * k * m) &&
+        moved.size() == size_t(n * nv * m));
+  for (int64_t i = 0; i < n; i++)
+    push_of(R.data() + i * nv * nv, rows.data() + i * k * nv, forces.data() + i * k * nv, by.data() + i * k * m,
+            static_cast<int>(k), static_cast<int>(nv), static_cast<int>(m), moved.data() + i * nv * m);
 }
 
 }  // namespace
@@ -321,6 +328,7 @@ NB_MODULE(_mujoco, m) {
         "Tendons at many positions. Returns where MuJoCo said an error or warned.");
   m.def("simulate", &simulate, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "after"_a,
         "Steps from many states. Returns where MuJoCo said an error.");
-  m.def("solve_soft", &solve_soft, "J"_a, "R"_a, "q"_a, "compliance"_a, "low"_a, "high"_a, "threads"_a, "force"_a,
-        "Forces between bounds on soft rows. Returns how many problems are not solved.");
+  m.def("solve_forces", &solve_forces, "c"_a, "threads"_a, "F"_a, "q"_a, "low"_a, "high"_a, "lam"_a, "found"_a,
+        "Forces between bounds.");
+  m.def("push", &push, "R"_a, "rows"_a, "forces"_a, "by"_a, "moved"_a, "Motion by forces that moves rows so far.");
 }
