@@ -43,11 +43,15 @@ constexpr double kEqual = 3e-4;
 constexpr double kReach = 3.0, kNone = 100.0;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
+// So many starts or more are searched in groups of at least this many, each with a local search of its own: what one
+// group ends in depends on where it began, and the best of several is better than one that goes on for longer. An
+// element has no further group if the starts of one agree, or if so many groups end with its best plan.
+constexpr int64_t kGroup = 16, kLargestGroup = 2 * kGroup - 1, kAgreed = 3;
 // The homotopy makes one step per stage, and two if a problem is solved again along one that starts at this
 // multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
-// Starts from the kSoftPulses-th on, which are pulses, follow a homotopy from contact so many powers of ten softer.
+// Starts from the kSoftPulses-th of each kGroup on, which are pulses, follow a homotopy from contact so many powers of ten softer.
 constexpr int64_t kSoftPulses = 8;
 constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
@@ -76,11 +80,11 @@ constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::a
 // action is pushed for a while.
 constexpr double kMelted = 2.0, kMeltedMore = 4.5, kNoise = 0.1, kPart = 0.1, kPartMore = 0.8, kMostLater = 3.0;
 constexpr double kShortest = 0.05, kLongest = 0.6, kLeastPush = 0.25;  // a push, in parts of horizon and range
-// It ends when kRounds, or a quarter of the starts' number if that is more, have not made the cost smaller by the part
-// kGain. Once one has, there is more to find: it ends after as many rounds in vain as there are starts. Plans of kLong
-// stages get as many again, shorter ones fewer, and half as many at least where one start alone found the plan. Eight
-// times the starts' number are the most. Fewer starts than kVaried have one round, of three shifts and kSoftest, which
-// is solved anew from softer contact; fewer than kFixed none.
+// It ends when kRounds have not made the cost smaller by the part kGain. Once one has, there is more to find: it ends
+// after as many rounds in vain as there are starts. Plans of kLong stages get as many again, shorter ones fewer, and
+// half as many at least where one start alone found the plan. Eight times the starts' number are the most. Fewer starts
+// than kVaried have one round, of three shifts and kSoftest, which is solved anew from softer contact; fewer than kFixed
+// none.
 constexpr double kGain = 1e-3;
 constexpr int64_t kLong = 48, kFewVaried = 4, kSoftest = kVaried + 1;
 
@@ -202,6 +206,12 @@ int64_t finders(const double* reached, int64_t count, double one) {
   return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * std::abs(one); });
 }
 
+// Whether plan `i` of some is better than plan `j` of others.
+bool better(const MpcPlans& a, int64_t i, const MpcPlans& b, int64_t j) {
+  const bool done = solved(a.status[i]);
+  return done == solved(b.status[j]) ? a.objective[i] < b.objective[j] : done;
+}
+
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
   const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
@@ -242,7 +252,7 @@ MpcPlans MpcSearch::Store::plans() {
 }
 
 void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
-  const int64_t jobs = starts * batch.count;
+  const int64_t jobs = std::min(starts, kLargestGroup) * batch.count;
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
   reached.reserve(jobs);
@@ -250,6 +260,10 @@ void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   live.reserve(batch.count);
   idle.reserve(batch.count);
   patience.reserve(batch.count);
+  members.reserve(batch.count);
+  agreed.reserve(batch.count);
+  unsettled.reserve(batch.count);
+  if (starts >= 2 * kGroup) earlier.resize(batch, batch.count);
   origin.reserve(jobs);
 }
 
@@ -288,7 +302,7 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
-  const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
+  const int64_t chunk = std::max(kChunk, kJobs / std::min(effort.starts, kLargestGroup));
   MpcBatch searched = batch;
   const bool near = effort.starts == 1 && guess.lam;  // a plan with its forces, of the step before
   searched.relaxation = near ? batch.relaxation : softer(batch);
@@ -306,18 +320,18 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.n_c > 0) judge_constraints(batch, solver_options(effort, out), runner);
 }
 
-// Sets the first actions of a job: the best plan of its element so far is that of job `best`.
-void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
+// Sets the first actions of a job. `best`: the actions of the best plan of its element so far, if there is one.
+void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, const double* best) {
   const Sizes n(b);
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
-  if (s.actions == Actions::pulse && start >= kSoftPulses)
+  if (s.actions == Actions::pulse && start % kGroup >= kSoftPulses)
     tried.start[job].at_least *= power_of_ten(kSoftened, kSoftenedMore, uniform(effort.seed, start, -1));
   tried.start[job].explore = s.explore;
   double* u = tried.u.data() + job * n.u;
   double largest = 1.0;
-  for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
-  const double far = best >= 0 ? kNone * largest : kHuge;
+  for (int64_t i = 0; best && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(best[i]));
+  const double far = best ? kNone * largest : kHuge;
   const auto end = [&](double bound) { return std::abs(bound) < far ? bound : std::copysign(kReach * largest, bound); };
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(b, tried.element[job], i);
@@ -377,20 +391,51 @@ void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
 void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
                        const MpcPlans& out, Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
-  const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
-  const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
-  const int64_t shift = guessed ? 1 : 0;
+  const int64_t groups = std::max<int64_t>(1, effort.starts / kGroup);
   const MpcPlans to = shifted(batch, out, first);
+  agreed.assign(count, 1);
+  members.resize(count);
+  std::iota(members.begin(), members.end(), 0);
+  for (int64_t g = 0; g < groups && !members.empty() && (g == 0 || !runner.stopped()); g++) {
+    const int64_t begin = g * effort.starts / groups;
+    MpcEffort part = effort;
+    part.starts = (g + 1) * effort.starts / groups - begin;
+    part.seed += uint64_t(g) << 32;
+    earlier.resize(batch, g > 0 ? count : 0);
+    for (int64_t e : members) {
+      if (g > 0) copy_plan(n, to, e, earlier.plans(), e);
+      if (g > 0) earlier.iterations[e] = to.iterations[e];
+    }
+    search_group(batch, target, guess, part, begin, to, runner, first, count);
+    for (int64_t e : members) {
+      if (g == 0) break;
+      const double now = to.objective[e], before = earlier.objective[e];
+      agreed[e] = now < needed(before) ? 1 : agreed[e] + !(before < needed(now));
+      to.iterations[e] += earlier.iterations[e];
+      if (!better(to, e, earlier.plans(), e)) copy_plan(n, earlier.plans(), e, to, e);
+    }
+    members.swap(unsettled);
+    const auto done = [&](int64_t e) { return agreed[e] >= kAgreed; };
+    members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
+  }
+}
+
+// Solves the elements `members` from those of the starts that begin with this one, with a guess for the very first.
+void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
+                             int64_t start, const MpcPlans& out, Runner& runner, int64_t first, int64_t count) {
+  const Sizes n(batch);
+  const bool guessed = guess.u && start == 0, whole = guess.lam;  // by actions alone, or by forces too
+  const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
+  const int64_t shift = guess.u ? 1 : 0;
 
   tried.resize(batch, 0);
   reached.resize(count * starts);
   best.assign(count, -1);
-  live.resize(count);
-  std::iota(live.begin(), live.end(), 0);
+  live = members;
   for (int64_t begun = 0; begun < starts && !live.empty() && !runner.stopped();) {
     const bool from_guess = guessed && begun == 0;
     // Starts with large actions and no bounds wait for those that show how far to go.
-    const bool near = begun == shift && batch.unbounded;
+    const bool near = start == 0 && begun == shift && batch.unbounded;
     const int64_t wide = near ? begun + kNear : begun < kFixed ? kFixed : begun < half ? half : starts;
     const int64_t end = from_guess ? 1 : std::min(starts, wide);
     // Job before + s * elements + i is start begun + s of the i-th element that is not done.
@@ -409,7 +454,8 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
       } else {
-        begin(batch, effort, begun + (j - before) / elements - shift, j, best[e]);
+        const double* u = best[e] >= 0 ? tried.u.data() + best[e] * n.u : start > 0 ? earlier.u.data() + e * n.u : nullptr;
+        begin(batch, effort, start + begun + (j - before) / elements - shift, j, u);
       }
       if (begun >= kFixed) tried.start[j].needed = needed(tried.objective[best[e]]);
     }
@@ -429,8 +475,9 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   }
 
-  finish(batch, guess, effort, to, runner, first, count);
-  improve(batch, effort, to, runner, first, count);
+  unsettled = live;
+  finish(batch, guess, effort, out, runner, first);
+  improve(batch, effort, out, runner, first, count);
 }
 
 // Solves those jobs to the end that are wanted. Returns their number: they are the first of `finished`, and `origin`
@@ -463,11 +510,13 @@ int64_t MpcSearch::solve_tried(const MpcBatch& batch, const MpcEffort& effort, R
 // Solves the jobs to the end that may still become the best of their element. A start whose last step gained less than
 // it lies behind, or that approaches the same plan, is given up, unless all others of its element fail.
 void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-                       Runner& runner, int64_t first, int64_t count) {
+                       Runner& runner, int64_t first) {
   const Sizes n(batch);
   const int64_t all = tried.count();
-  std::fill_n(out.status, count, kUnreached);
-  std::fill_n(out.iterations, count, 0);
+  for (int64_t e : members) {
+    out.status[e] = kUnreached;
+    out.iterations[e] = 0;
+  }
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
     out.iterations[e] += from.iterations[i];
     const bool done = solved(from.status[i]);
@@ -490,7 +539,7 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, tried.owner[j], true);
   if (!runner.stopped())
     solve([&](int64_t j) { return !solved(out.status[tried.owner[j]]) && !promises(j); });
-  for (int64_t e = 0; e < count; e++) {
+  for (int64_t e : members) {
     // Out of time after its starts were compared: one that was solved by chance need not be the best.
     const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < needed(out.objective[e]);
     if (out.status[e] != kUnreached && !(runner.stopped() && behind)) continue;
@@ -498,8 +547,9 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
       copy_plan(n, tried.plans(), best[e], out, e);
       out.status[e] = int8_t(Status::max_iter);
     } else {
-      const MpcBatch elements = part_of(batch, count, tried.element.data());
-      stay_at_start(elements, {guess.u ? guess.u + first * n.u : nullptr, nullptr, nullptr}, out, e);
+      const int64_t element = batch.element_of(first + e);
+      stay_at_start(part_of(batch, 1, &element), {guess.u ? guess.u + (first + e) * n.u : nullptr, nullptr, nullptr},
+                    shifted(batch, out, e), 0);
     }
   }
 }
@@ -586,7 +636,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
   const int64_t starts = effort.starts, more = starts * std::min(batch.horizon, kLong) / kLong;
   const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * starts;
   idle.assign(count, 0);
-  patience.assign(count, std::max(kRounds, starts / 4));
+  patience.assign(count, kRounds);
   for (int64_t e : live) {
     const double* own = reached.data() + e * starts;
     const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;

@@ -87,11 +87,13 @@ class MpcSearch {
                   Runner& runner, int64_t first, int64_t count, int64_t steps);
   void search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
               const MpcPlans& out, Runner& runner, int64_t first, int64_t count);
+  void search_group(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort, int64_t start,
+                    const MpcPlans& out, Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                bool guessed);
-  void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, int64_t best);
+  void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, const double* best);
   void finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-              Runner& runner, int64_t first, int64_t count);
+              Runner& runner, int64_t first);
   template <class Wanted>
   int64_t solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted);
   void harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
@@ -103,9 +105,11 @@ class MpcSearch {
   void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
   const Kernels& kernels;
-  Store tried, finished;
+  Store tried, finished, earlier;  // earlier: the plans of earlier groups
   std::vector<double> reached;  // objectives of the starts of each element
   std::vector<int64_t> best;    // of the jobs tried for each element
+  std::vector<int64_t> members, unsettled;    // the elements of a group, and those of them whose starts disagree
+  std::vector<int64_t> agreed;  // how many groups end with the best plan of each element
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };

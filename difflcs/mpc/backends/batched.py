@@ -17,7 +17,7 @@ from difflcs.mpc.solution import Primal
 from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
-_STARTS: dict[str, tuple[int, int]] = {"fast": (1, 3), "default": (4, 16), "best": (16, 64)}
+_STARTS: dict[str, tuple[int, int]] = {"fast": (1, 3), "default": (4, 16), "best": (16, 128)}
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
 # numbers: with four starts the worst costs 2.7 times the best on a row of four carts, 45 % more on a cart-pole, H 30.
 _MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON = 100, 20, 40
@@ -54,14 +54,15 @@ class BatchedBackend(Backend):
     solved to the end; at a harder relaxation the plan that is found is solved once more. Half of the starts, eight for
     each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
-    for long plans. Of four to seven starts only four of these are tried.
+    for long plans. Of four to seven starts only four of these are tried. From 32 starts on, groups of sixteen are
+    searched so one after the other, until three end with the same plan, and the best plan of all counts.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", four; "best", sixteen; 3, 16 and 64 where horizon × n_lam is 100 or
+        effort: "fast", one start; "default", four; "best", sixteen; 3, 16 and 128 where horizon × n_lam is 100 or
             more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the first start, and
             the only one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search.
