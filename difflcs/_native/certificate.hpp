@@ -18,16 +18,15 @@ constexpr double kSure = 2e-7;
 struct Certificate {
   const MpcBatch& batch;
   const AnySizes n;
-  Steps<Vec> matrix[kInputs];  // in the caller's units: matrices here,
-  Steps<Vec> vector[kInputs];  // vectors here
-  Steps<Vec> rest, transposed_A, transposed_Q;
-  // Of the current stage.
-  Vec *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u, *A_t, *Q_t;
-  Vec *d, *c, *q, *r, *lo, *hi;
+  Steps<Vec> field[kInputs], rest, transposed_A;  // in the caller's units
+  Vec *at[kInputs], *A_t;                        // of the current stage
+  Vec *&A = at[kA], *&B = at[kB], *&C = at[kC], *&D = at[kD], *&E = at[kE], *&F = at[kF], *&Q = at[kQ], *&R = at[kR],
+      *&cross = at[kS], *&G_x = at[kG_x], *&G_u = at[kG_u], *&d = at[kd], *&c = at[kc], *&q = at[kq], *&r = at[kr],
+      *&lo = at[ku_min], *&hi = at[ku_max];
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
   // Sizes of all states, and at one stage of the costates and of rho's response to them (conditions.py: `sizes`); terms
   // of both.
-  Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown, *absolute;
+  Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown, *cost;
   Vec* moved;                         // change of each state by the ranges of the earlier actions
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
@@ -40,21 +39,16 @@ struct Certificate {
   void layout(Arena& arena, bool kept) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int i = 0; i < kInputs; i++) {
-      const Field& field = kMpcFields[i];
-      const int64_t stages = batch.step[i] == 0 ? 1 : stages_of(batch, field);
-      if (field.columns == Size::one)
-        arena.take(vector[i], stages, extent(batch, field));
-      else
-        arena.take(matrix[i], stages, extent(batch, field));
+      const Field& kind = kMpcFields[i];
+      arena.take(field[i], batch.step[i] == 0 ? 1 : stages_of(batch, kind), extent(batch, kind));
     }
     arena.take(rest, h, nu);
-    arena.take(transposed_A, matrix[kA].count, nx * nx);
-    arena.take(transposed_Q, matrix[kQ].count, nx * nx);
+    arena.take(transposed_A, field[kA].count, nx * nx);
     arena.take_all((h + 1) * nx, x, x_size);
     arena.take(u, h * nu);
     arena.take_all(h * nl, lam, gap);
     arena.take_all((h + 1) * nc, mu, row);
-    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown, absolute);
+    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown, cost);
     arena.take_all(nl, y, rho, error, rows, rho_size, rho_terms);
     arena.take(N, nl * nl);
     arena.take(largest_action, nu);
@@ -66,47 +60,27 @@ struct Certificate {
   void load(Vec* to, const double* from, int64_t count, int lane) {
     for (int64_t i = 0; i < count; i++) put(to, i, lane, from[i]);
   }
-  void load(const Steps<Vec>& to, int which, int64_t e, int lane) {
-    load(to.first, batch.at(which, e), to.count * to.size, lane);
+  void load(int which, int64_t e, int lane) {
+    load(field[which].first, batch.at(which, e), field[which].count * field[which].size, lane);
   }
 
   void load_matrices(int64_t e, int lane) {
     for (int i = 0; i < kInputs; i++)
-      if (kMpcFields[i].columns != Size::one) load(matrix[i], i, e, lane);
-    const auto transpose = [&](const Steps<Vec>& from, const Steps<Vec>& to) {
-      for (int64_t k = 0; k < from.count; k++)
-        for (int64_t i = 0; i < n.x() * n.x(); i++)
-          put(to[k], i % n.x() * n.x() + i / n.x(), lane, lane_of(from[k][i], lane));
-    };
-    transpose(matrix[kA], transposed_A);
-    transpose(matrix[kQ], transposed_Q);
-    const bool alike = matrix[kB].count == 1 && matrix[kQ].count == 1 && matrix[kR].count == 1;
-    const auto entries = [&](Input which) { return [this, which](int64_t k) { return matrix[which][k]; }; };
-    curvature_at_rest(n, entries(kB), n.u(), entries(kQ), matrix[kQ_final][0], entries(kR), alike, rest, lane);
+      if (kMpcFields[i].columns != Size::one) load(i, e, lane);
+    for (int64_t k = 0; k < transposed_A.count; k++)
+      for (int64_t i = 0; i < n.x() * n.x(); i++)
+        put(transposed_A[k], i % n.x() * n.x() + i / n.x(), lane, lane_of(field[kA][k][i], lane));
+    const bool alike = field[kB].count == 1 && field[kQ].count == 1 && field[kR].count == 1;
+    const auto entries = [&](Input which) { return [this, which](int64_t k) { return field[which][k]; }; };
+    curvature_at_rest(n, entries(kB), n.u(), entries(kQ), field[kQ_final][0], entries(kR), alike, rest, lane);
   }
+
+  Matrix<Vec, 0, 0> square(Vec* entries) const { return {entries, {n.x()}, {n.x()}, {n.x()}}; }
 
   // Goes to stage k; at the last only the constraints mean something.
   void enter(int64_t k) {
-    G_x = matrix[kG_x][k];
-    if (k == n.h) return;
-    A = matrix[kA][k];
+    for (int i = 0; i < kInputs; i++) at[i] = field[i][k];
     A_t = transposed_A[k];
-    Q_t = transposed_Q[k];
-    B = matrix[kB][k];
-    C = matrix[kC][k];
-    D = matrix[kD][k];
-    E = matrix[kE][k];
-    F = matrix[kF][k];
-    Q = matrix[kQ][k];
-    R = matrix[kR][k];
-    cross = matrix[kS][k];
-    G_u = matrix[kG_u][k];
-    d = vector[kd][k];
-    c = vector[kc][k];
-    q = vector[kq][k];
-    r = vector[kr][k];
-    lo = vector[ku_min][k];
-    hi = vector[ku_max][k];
   }
 
   // Largest residual so far; NaN counts as infinite.
@@ -189,7 +163,7 @@ struct Certificate {
       const int64_t e = elements[l < count ? l : 0];
       if (!shared) load_matrices(e, l);
       for (int i = 0; i < kInputs; i++)
-        if (kMpcFields[i].columns == Size::one) load(vector[i], i, e, l);
+        if (kMpcFields[i].columns == Size::one) load(i, e, l);
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l);
       load(u, o.u + e * h * nu, h * nu, l);
       load(lam, o.lam + e * h * nl, h * nl, l);
@@ -201,7 +175,7 @@ struct Certificate {
     }
     worst = poison = all(0);
     Mask fragile = Mask{};
-    for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
+    for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - field[kx0][0][i], abs(field[kx0][0][i])}.relative());
     trajectory();
     const Mask weak = constraints();
     costates(fragile);
@@ -229,8 +203,8 @@ struct Certificate {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     enter(h);
     for (int64_t i = 0; i < nx; i++) {
-      const Vec* weights = matrix[kQ_final][0];
-      Vec t = vector[kq_final][0][i], all_terms = abs(t);
+      const Vec* weights = field[kQ_final][0];
+      Vec t = field[kq_final][0][i], all_terms = abs(t);
       for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
       for (int64_t j = 0; j < nx; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);
       for (int64_t m = 0; m < nc; m++) {
@@ -278,18 +252,17 @@ struct Certificate {
         g.terms = max(g.terms, kCancelled * whole);
         action(k, j, uk[j], g);
       }
-      for (int64_t i = 0; i < nx; i++) absolute[i] = abs(p[i]);
+      multiply_columns(square(A), p, q, pn);
+      for (int64_t i = 0; i < nx; i++) cost[i] = all(0);
+      multiply_symmetric(square(Q), xk, cost, cost);
       by_columns(0, nx, [&](int64_t i, auto kind) {
         using V = decltype(kind);
-        const V first = read<V>(q, i);
-        SumOf<V> sum{first, abs(first)}, cost{};  // side by side, so that neither waits for the other
-        V along{}, through{};
+        SumOf<V> sum{read<V>(pn, i), abs(read<V>(q, i))};
+        V along{}, through{}, cost_terms{};
         for (int64_t j = 0; j < nx; j++) {
-          const V a = read<V>(A + j * nx, i), weight = read<V>(Q_t + j * nx, i), size_of_a = abs(a);
-          cost.value += weight * xk[j];
-          cost.terms += abs(weight) * size[j];
-          sum.value += a * p[j];
-          sum.terms += size_of_a * absolute[j];
+          const V size_of_a = abs(read<V>(A + j * nx, i));
+          cost_terms += abs(read<V>(Q + j * nx, i)) * size[j];
+          sum.terms += size_of_a * abs(p[j]);
           along += size_of_a * p_size[j];
         }
         for (int64_t j = 0; j < nl; j++) {
@@ -298,8 +271,8 @@ struct Certificate {
           through += abs(slope * rho_terms[j]);
         }
         for (int64_t m = 0; m < nc; m++) sum.add(read<V>(G_x + m * nx, i) * mk[m]);
-        write<V>(pn, i, sum.value + cost.value);
-        write<V>(terms, i, sum.terms + cost.terms);
+        write<V>(pn, i, sum.value + read<V>(cost, i));
+        write<V>(terms, i, sum.terms + cost_terms);
         write<V>(grown, i, max(along, through));
       });
       for (int64_t i = 0; i < nx; i++) {
@@ -326,20 +299,16 @@ struct Certificate {
       enter(k);
       const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
       const Vec* size = x_size + k * nx;
-      for (int64_t i = 0; i < nx; i++) absolute[i] = abs(xk[i]);
+      multiply_columns(square(A_t), xk, d, pn);
       by_columns(0, nx, [&](int64_t i, auto kind) {
         using V = decltype(kind);
-        const V first = read<V>(d, i);
-        SumOf<V> sum{first, abs(first)};
-        V along{};
+        V all_terms = abs(read<V>(d, i)), along{};
         for (int64_t j = 0; j < nx; j++) {
-          const V a = read<V>(A_t + j * nx, i), size_of_a = abs(a);
-          sum.value += a * xk[j];
-          sum.terms += size_of_a * absolute[j];
+          const V size_of_a = abs(read<V>(A_t + j * nx, i));
+          all_terms += size_of_a * abs(xk[j]);
           along += size_of_a * size[j];
         }
-        write<V>(pn, i, sum.value);
-        write<V>(terms, i, sum.terms);
+        write<V>(terms, i, all_terms);
         write<V>(grown, i, along);
       });
       for (int64_t i = 0; i < nx; i++) {
@@ -366,7 +335,7 @@ struct Certificate {
     }
   }
 
-  Vec width(int64_t k, int64_t j) const { return range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]); }
+  Vec width(int64_t k, int64_t j) const { return range(largest_action[j], field[ku_min][k][j], field[ku_max][k][j]); }
 
   // Stationarity of one action with the reduced gradient g, and its bounds.
   void action(int64_t k, int64_t j, Vec at, Sum g) {
@@ -396,7 +365,7 @@ struct Certificate {
     for (int64_t i = 0; i < nc; i++) row_terms[i] = row_missed[i] = all(0);
     for (int64_t k = 0; k <= h && nc > 0; k++) {
       enter(k);
-      const Vec *g = vector[kg][k], *price = vector[kprice][k];
+      const Vec *g = at[kg], *price = at[kprice];
       for (int64_t i = 0; i < nc; i++) {
         const Mask given = g[i] < kHuge;
         Sum sum{select(given, -g[i], all(0)), select(given, abs(g[i]), all(0))};
@@ -423,7 +392,7 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
         const Vec m = mu[k * nc + i], value = row[k * nc + i], close = kWeak * row_terms[i];
         const Mask at_zero = ~(m > 0) & (value >= -close),
-                   at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
+                   at_price = (m >= kAtPrice * field[kprice][k][i]) & (value <= close);
         weak |= (at_zero | at_price) & (acts > 0);
       }
     }

@@ -12,7 +12,6 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
-#include <iterator>
 #include <limits>
 #include <memory>
 #include <new>
@@ -447,16 +446,14 @@ void violation_gradient(Inputs inputs, double xi, Array z, Output<double> r, Out
 // ---- tables ----
 
 // Fields of an MPC problem with the kinds of their dimensions, as difflcs.mpc.problem.INPUTS has them.
-nb::dict fields(const difflcs::Field* begin, const difflcs::Field* end) {
+template <size_t N>
+nb::dict fields(const difflcs::Field (&all)[N]) {
   nb::dict table;
-  auto name = [](difflcs::Size size) { return nb::str(difflcs::kSizeNames[int(size)]); };
-  for (const difflcs::Field* f = begin; f != end; f++) {
-    if (rank_of(*f) == 0)
-      table[f->name] = nb::make_tuple();
-    else if (rank_of(*f) == 1)
-      table[f->name] = nb::make_tuple(name(f->rows));
-    else
-      table[f->name] = nb::make_tuple(name(f->rows), name(f->columns));
+  for (const difflcs::Field& f : all) {
+    nb::list sizes;
+    for (const difflcs::Size size : {f.rows, f.columns})
+      if (size != difflcs::Size::one) sizes.append(nb::str(difflcs::kSizeNames[int(size)]));
+    table[f.name] = nb::tuple(sizes);
   }
   return table;
 }
@@ -503,14 +500,9 @@ bool all_finite(const std::vector<Array>& arrays) {
 NB_MODULE(_kernels, m) {
   m.doc() = "Native kernels of difflcs. Private: use the functions of difflcs.";
   m.def("isa", [] { return difflcs::kernels().isa; }, "Instruction set in use.");
-  m.def(
-      "mpc_fields", [] { return fields(std::begin(difflcs::kMpcFields), std::end(difflcs::kMpcFields)); },
-      "Inputs of an MPC problem in their order, with the dimensions of each.");
+  m.def("mpc_fields", [] { return fields(difflcs::kMpcFields); }, "Inputs of an MPC problem, with their dimensions.");
   m.def("mpc_stages", &stages, "How many stages each has where it is given by stage.");
-  m.def(
-      "violation_fields",
-      [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
-      "The same of the violation loss.");
+  m.def("violation_fields", [] { return fields(difflcs::kViolationFields); }, "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
   m.def("tolerances", &tolerances, "Tolerances that the reference in Python has too.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");

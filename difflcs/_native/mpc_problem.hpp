@@ -149,6 +149,7 @@ struct ProblemData {
   Matrix<Vec, 0, 0> multiplier;  // of the constraints
   Vec rho, weight{};  // of the augmented Lagrangian, and the largest weight of the cost, its unit
 
+  Mask* has_law;  // whether the law that the solver keeps (newton.hpp) is still that of the problem
   void (ProblemData::*load_rows)(int64_t element, int lane);  // `load_sized_rows` with the sizes that are known
 
   ProblemData(const MpcBatch& b, bool caller_units)
@@ -188,10 +189,12 @@ struct ProblemData {
     arena.take(product, nw);
     arena.take(multiplier, h + 1, nc);
     arena.take(reach, nc);
+    arena.take(has_law, 1);
     if (!arena.memory) return;
     const int64_t mine = shared && !caller_units && !batch.pivot ? batch.version * 16 + kLanes : 0;
     kept = batch.version > 0 && mine > 0 && *version == mine;
     *version = mine;
+    if (!kept) *has_law = Mask{};
     if (shared && !kept) load_matrices(0, 0);
   }
 
@@ -311,10 +314,14 @@ struct ProblemData {
   // Puts problem `e` into a lane.
   void load(int64_t e, int lane) {
     if (!shared) load_matrices(e, lane);
+    bool same = shared;
     auto vector = [&](const Steps<Vec>& to, Input which, double unit = 1.0) {
       for (int64_t k = 0; k < to.count; k++) {
         const double* from = input(which, e, k);
-        for (int64_t i = 0; i < to.size; i++) put(to[k], i, lane, from[i] * unit);
+        for (int64_t i = 0; i < to.size; i++) {
+          same = same && to[k][i][lane] == from[i] * unit;
+          put(to[k], i, lane, from[i] * unit);
+        }
       }
     };
     const double cost = lane_of(cost_unit[0], lane);
@@ -324,10 +331,9 @@ struct ProblemData {
     vector(r, kr, cost);
     vector(u_min, ku_min);
     vector(u_max, ku_max);
-    for (int64_t i = 0; i < n.x(); i++) {
-      put(q_final, i, lane, input(kq_final, e)[i] * cost);
-      put(x0, i, lane, input(kx0, e)[i]);
-    }
+    vector({q_final, n.x(), 1, 0}, kq_final, cost);
+    for (int64_t i = 0; i < n.x(); i++) put(x0, i, lane, input(kx0, e)[i]);
+    if (!same) (*has_law)[lane] = 0;
     for (int64_t k = 0; k < per_width.count; k++)
       for (int64_t i = 0; i < n.u(); i++) {
         const double width = u_max[k][i][lane] - u_min[k][i][lane];
@@ -456,10 +462,10 @@ struct ProblemData {
     };
     Vec total = quadratic(Matrix<T, S::kX, S::kX>(Q_final), q_final, at.x[n.h]);
     for (int64_t k = 0; k < n.h; k++) {
-      const StageData<T, S> here = stage<S>(k);
-      total += quadratic(here.Q, here.q, at.x[k]) + quadratic(here.R, here.r, at.u[k]);
+      total += quadratic(Matrix<T, S::kX, S::kX>(Q[k]), q[k], at.x[k]) +
+               quadratic(Matrix<T, S::kU, S::kU>(R[k]), r[k], at.u[k]);
       if (batch.crossed)
-        for (int64_t i = 0; i < n.x(); i++) total += at.x(k, i) * (all(0) + here.cross.row(i) * at.u[k]);
+        for (int64_t i = 0; i < n.x(); i++) total += at.x(k, i) * (all(0) + cross[k].row(i) * at.u[k]);
     }
     if (batch.barrier > 0)
       for (int64_t k = 0; k < n.h; k++)

@@ -4,6 +4,8 @@
 // A released problem begins without contact: one Riccati sweep from its first actions gives the feedback law of the
 // free plant, which is rolled out with contact and clipped to the bounds. An unstable plant has fallen over where its
 // actions alone are rolled out. The gaps along it also tell the scale of the problem, from which the homotopy starts.
+// Of a quadratic program with bounds alone the law without bounds, made around x = 0, is that of every initial state.
+// It is kept until another number changes, and tried where there is no guess, or one that is inside the bounds.
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
@@ -24,6 +26,10 @@ class Solver {
   Riccati<T, S, false> riccati;
   Progress<T> progress;
   Trajectory<S> at, next;  // the iterate, which `progress` has too, and the trial
+  struct Law {
+    Matrix<Vec, 0, S::kU> feedforward;
+    Stages<Matrix<Vec, S::kU, S::kX>> feedback;
+  } law, origin;  // of the next step, and the one around x = 0 where that is kept
   Vec *newton, *dx, *du;
   Mask* rows;
 
@@ -41,6 +47,8 @@ class Solver {
     next.layout(arena, n);
     arena.take(newton, Lcp::scratch(n.l()));
     arena.take(rows, n.l());
+    arena.take(origin.feedforward, problem.linear() ? n.h : 0, n.u());
+    arena.take(origin.feedback, problem.linear() ? n.h : 0, n.u(), n.x());
     arena.take(dx, n.x());
     arena.take(du, n.u());
     riccati.layout(arena);
@@ -81,12 +89,11 @@ class Solver {
     for (int64_t i = 0; i < nx; i++) next.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       const StageData<T, S>& data = problem.stage(k);
-      const Matrix<Vec, S::kU, S::kX> K = riccati.feedback[k];
+      const Matrix<Vec, S::kU, S::kX> K = law.feedback[k];
       for (int64_t j = 0; j < nu; j++) {
         const Vec from = at.u(k, j);
-        Vec to = from + step * riccati.feedforward(k, j);
-        if (k > 0)
-          for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
+        Vec to = from + step * law.feedforward(k, j);
+        for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
         Vec low = data.u_min[j], high = data.u_max[j];
         if (batch.barrier > 0) {  // at most nine tenths of the way to a bound
           low = from - 0.9 * (from - low);
@@ -105,6 +112,31 @@ class Solver {
       data.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
     }
     return problem.cost(next);
+  }
+
+  // The sweep around the iterates, with the law of the next step. That around x = 0, of the lanes `fresh`, may be kept.
+  Sweep sweep(Mask fresh, Mask idle) {
+    for (int64_t i = 0; i < at.x.size() && any(fresh); i++) at.x.entries[i] = zero_where(fresh, at.x.entries[i]);
+    Sweep made{};
+    made.exact = fresh;
+    law = origin;
+    if (!any(~(fresh & *problem.has_law) & ~idle)) return made;
+    // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
+    Mask keep_curvature;
+    for (int l = 0; l < kLanes; l++)
+      keep_curvature[l] = progress.lane[l].in_stage > 20 && progress.lane[l].in_stage % 2 ? -1 : 0;
+    made = riccati.sweep(at, {},
+                         {progress.regularisation, keep_curvature, progress.gauss_newton, progress.released, fresh});
+    law = {riccati.feedforward, riccati.feedback};
+    const Mask exact = fresh & made.exact;
+    made.weak &= ~exact;  // x = 0 is no plan
+    const auto keep = [&](Vec* to, const Vec* from, int64_t count) {
+      for (int64_t i = 0; i < count && any(exact); i++) to[i] = select(exact, from[i], to[i]);
+    };
+    keep(origin.feedforward.entries, law.feedforward.entries, n.h * n.u());
+    keep(origin.feedback.first.entries, law.feedback.first.entries, n.h * n.u() * n.x());
+    *problem.has_law |= exact;
+    return made;
   }
 
   // Makes the trial the iterate.
@@ -176,7 +208,8 @@ template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   progress.eps = all(batch.relaxation);
   progress.regularisation = progress.J = all(0);
-  progress.needs_rollout = progress.stale_cost = progress.released = progress.gauss_newton = Mask{};
+  progress.needs_rollout = progress.stale_cost = Mask{};
+  progress.released = progress.gauss_newton = progress.at_origin = Mask{};
   progress.waiting = 0;
   int live = 0;
   Mask weak = Mask{};
@@ -200,12 +233,8 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     }
     if (any(progress.stale_cost)) progress.J = select(progress.stale_cost, problem.cost(at), progress.J);
     progress.needs_rollout = progress.stale_cost = Mask{};
-    // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
-    Mask keep_curvature;
-    for (int l = 0; l < kLanes; l++)
-      keep_curvature[l] = progress.lane[l].in_stage > 20 && progress.lane[l].in_stage % 2 ? -1 : 0;
-    const Sweep sweep =
-        riccati.sweep(at, {}, {progress.regularisation, keep_curvature, progress.gauss_newton, progress.released});
+    const Mask fresh = progress.at_origin & ~idle;
+    const Sweep sweep = this->sweep(fresh, idle);
     const Mask frozen = progress.finish(o, sweep, riccati.force, counter, idle, live);
     if (live == 0) break;
     weak = sweep.weak;

@@ -80,6 +80,7 @@ struct Progress {
   Mask needs_rollout;  // without a trajectory at its eps
   Mask released;       // without contact yet
   Mask gauss_newton;   // by Gauss-Newton
+  Mask at_origin;      // released by the law around x = 0, see newton.hpp
   Mask stale_cost;     // J is that of earlier multipliers
   // Elements that are finished but not certified yet, and whether some direction at their plan is flat.
   int64_t finished[kLanes];
@@ -110,6 +111,26 @@ struct Progress {
       if (!problem.linear()) needs_rollout[l] = -1;
     }
     released &= ~which;
+    at_origin &= ~which;
+  }
+
+  // Whether these actions are inside their bounds, and none weakly active.
+  bool inside(const double* u, int l) const {
+    for (int64_t i = 0; i < n.h * n.u(); i++) {
+      const double low = problem.u_min[i / n.u()][i % n.u()][l], high = problem.u_max[i / n.u()][i % n.u()][l];
+      const double margin = low < -kHuge && high > kHuge ? 0.0 : kWeak * (high - low);
+      if (!(u[i] - low > margin && high - u[i] > margin)) return false;
+    }
+    return true;
+  }
+
+  // Whether every action has a price of its own; else a law around the origin is not exact.
+  bool priced(int l) const {
+    bool every = true;
+    for (int64_t k = 0, nu = n.u(); k < n.h; k++)
+      for (int64_t j = 0; j < nu; j++)
+        every = every && lane_of(problem.R[k](j, j), l) > kPriced * lane_of(problem.rest[k][j], l);
+    return every;
   }
 
   double first_relaxation(const MpcStart& start, double mean_gap) const {
@@ -124,7 +145,7 @@ struct Progress {
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
     lane[l] = {};
     needs_rollout[l] = -1;
-    released[l] = gauss_newton[l] = 0;
+    released[l] = gauss_newton[l] = at_origin[l] = 0;
     eps[l] = batch.relaxation;
     regularisation[l] = 0;
     if (e >= batch.count) return false;
@@ -133,12 +154,18 @@ struct Progress {
     gauss_newton[l] = o.start[e].gauss_newton ? -1 : 0;
     if (!released[l]) eps[l] = first_relaxation(o.start[e], 0);
     problem.load(e, l);
+    const double* u_start = o.u_start ? o.u_start + e * actions : nullptr;
+    if (problem.linear() && (released[l] || (u_start && inside(u_start, l))) && ((*problem.has_law)[l] || priced(l))) {
+      released[l] = at_origin[l] = -1;
+      needs_rollout[l] = 0;
+      u_start = nullptr;
+    }
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
     put(&problem.rho, 0, l, kPenalty * problem.weight[l]);
     for (int64_t i = 0; i < actions; i++) {
       const double low = problem.u_min[i / nu][i % nu][l], high = problem.u_max[i / nu][i % nu][l];
       const double margin = batch.barrier > 0 ? 0.01 * (high - low) : 0.0;
-      const double a = low + margin, b = high - margin, value = o.u_start ? o.u_start[e * actions + i] : 0.0;
+      const double a = low + margin, b = high - margin, value = u_start ? u_start[i] : 0.0;
       put(at.u.entries, i, l, value < a ? a : value > b ? b : value);
     }
     if (o.lam_start && !released[l])
@@ -189,13 +216,9 @@ struct Progress {
   // Whether an exact step (riccati.hpp) led to the optimum, which it then stores: if it was full and ended inside all
   // bounds, the certificate says so as well as another sweep. Of one problem alone.
   bool exact(const MpcSolve& o, const Sweep& sweep, Vec step) {
-    if (kLanes > 1 || needs_rollout[0] || !sweep.exact || sweep.weak[0] || step[0] < 1) return false;
-    for (int64_t i = 0; i < at.u.size(); i++) {
-      const Vec low = problem.u_min[i / n.u()][i % n.u()], high = problem.u_max[i / n.u()][i % n.u()];
-      const Vec margin = kWeak * (high - low), u = at.u.entries[i];
-      if (!any((u - low > margin) & (high - u > margin))) return false;
-    }
-    return accepted(o, 0, sweep, problem.multiplier) && o.residual[lane[0].element] <= kMet;
+    if (kLanes > 1 || needs_rollout[0] || !sweep.exact[0] || sweep.weak[0] || step[0] < 1) return false;
+    return inside(reinterpret_cast<const double*>(at.u.entries), 0) && accepted(o, 0, sweep, problem.multiplier) &&
+           o.residual[lane[0].element] <= kMet;
   }
 
   // A step of the multipliers, at the target of the homotopy: earlier they would follow plans that change.

@@ -26,6 +26,7 @@ struct Newton {
   Mask keep_curvature{};  // keeps the second derivative of lam where the Hessian is indefinite
   Mask gauss_newton{};    // never has it
   Mask unbounded{};       // knows no bounds
+  Mask at_origin{};       // is around x = 0, which is no trajectory, and has no bounds
 };
 
 // What a sweep finds besides the feedback law.
@@ -38,7 +39,7 @@ struct Sweep {
   Vec largest_multiplier;
   Vec cost_gradient;  // sizes of the gradients of the cost in states and actions, added up over the stages
   Mask weak;          // a bound is weakly active, or the reduced Hessian is singular
-  bool exact;         // Newton's step is, within the bounds: all is linear, and no stage damped, flat or singular
+  Mask exact;         // Newton's step is, within the bounds: all is linear, and no stage damped, flat or singular
 };
 
 // Value function of the steps from one on: Hessian, costate, and linear term.
@@ -72,6 +73,7 @@ class Riccati {
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Newton newton;
+  bool whole;        // all of the stage is wanted: of the first, whose state is given, only around x = 0
   Vec flat_damping;  // beside the kinks of constraints: damping of what is flat
   Sweep result;
 
@@ -125,7 +127,7 @@ class Riccati {
   // Around the trajectory `at`.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
-    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}, keeps};
+    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}, keeps ? ~Mask{} : Mask{}};
     flat_damping = all(0);
     for (int64_t i = 0; i < n.c(); i++) {
       row_terms[i] = problem.reach[i];
@@ -137,32 +139,34 @@ class Riccati {
       for (int64_t k = 0; k < n.h; k++) largest_action[j] = max(largest_action[j], abs(at.u(k, j)));
     }
     terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
-    const bool undamped = keeps && !any(newton.regularisation > 0);
-    bool same = undamped && problem.shared;  // P of the next stage is the one that this stage knows
+    const Mask damped = newton.regularisation > 0;
+    bool same = keeps && !any(damped) && problem.shared;  // P of the next stage is the one that this stage knows
     for (int64_t k = n.h - 1; k >= 0; k--) {
       const StageData<T, S>& data = problem.stage(k);
       const Value<S> next = value(k + 1);
-      same = same && known[k];
+      whole = k > 0 || any(newton.at_origin);
+      same = same && known[k] && !(k == 0 && whole);
       H = hessians[keeps ? k : 0];
       L = factors[keeps ? k : 0];
       const Stage<S> stage =
           same ? linearisation.stage(k) : linearisation.at(k, at.lam[k], at.s[k], next.p, newton.regularisation);
       constraints(k, data, at.x[k], at.u[k]);
+      if (any(newton.at_origin)) follow(data, next, at.u[k]);
       if (!same) stage_hessian(k, data, stage, next.P);
       const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
       actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar);
       states(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
       if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
       action_hessian(data);
-      bool sound = undamped;
-      if (!same || !holds(k)) sound = !any(factor(data)) && sound;
+      Mask poor = damped;
+      if (!same || !holds(k)) poor |= factor(data);
       if (!kAdjoint) step_within_bounds(k, data, at.u[k]);
-      same = same && sound && holds(k);
+      same = same && !any(poor) && holds(k);
       if (same)
         linear_value(k);
       else
         feedback_law(k);
-      if (keeps) keep(k, data, sound);
+      if (keeps) keep(k, data, poor);
     }
     for (int64_t i = 0; i < n.c(); i++)
       result.violated = max(result.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
@@ -175,6 +179,13 @@ class Riccati {
   }
 
  private:
+  // Takes the linear term of the value after a stage at the state that follows x = 0.
+  void follow(const StageData<T, S>& data, const Value<S>& next, const Vec* u) {
+    for (int64_t i = 0; i < n.x(); i++) column[i] = data.d[i] + data.B().row(i) * u;
+    for (int64_t i = 0; i < n.x(); i++)
+      next.v[i] = select(newton.at_origin, next.v[i] + next.P.row(i) * column, next.v[i]);
+  }
+
   void terminal(const Vec* x, const Vec* x_bar) {
     const int64_t nx = n.x();
     const Value<S> end = value(n.h);
@@ -214,10 +225,10 @@ class Riccati {
     }
   }
 
-  // H = blkdiag(Q, R) + A_hat^T P A_hat, lower triangle; its second-derivative part Y is added later. The first state
-  // is given: of stage 0 only the action block is needed.
+  // H = blkdiag(Q, R) + A_hat^T P A_hat, lower triangle; its second-derivative part Y is added later. Where the first
+  // state is given, only the action block of stage 0 is needed.
   void stage_hessian(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Matrix<Vec, kX, kX>& P) {
-    const int64_t nx = n.x(), nw = n.w(), first = k == 0 ? nx : 0;
+    const int64_t nx = n.x(), nw = n.w(), first = whole ? 0 : nx;
     by_columns(first, nw, [&](int64_t j, auto kind) {
       using V = decltype(kind);
       Local<kX, V> of_A(column);
@@ -242,7 +253,7 @@ class Riccati {
         columns(nx, i + 1, [&](int64_t j, auto kind) { return read<decltype(kind)>(data.R[i - nx], j - nx); });
       }
     }
-    if (problem.batch.crossed && k > 0)
+    if (problem.batch.crossed && whole)
       for (int64_t i = nx; i < nw; i++)
         for (int64_t j = 0; j < nx; j++) H(i, j) += data.cross(j, i - nx);
     for (int64_t r = 0; r < n.c(); r++) {
@@ -331,8 +342,8 @@ class Riccati {
         // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
         // Not after a failed step: the jump is not damped, and in an unstable system it can cost more than it gains.
         const Vec step = g / gauss_newton, near = select(newton.regularisation > 0, all(1e-12), all(1e-2)) * width;
-        lower(k, j) = (below <= near) & (step >= below) & (g > 0);
-        upper(k, j) = (above <= near) & (-step >= above) & (g < 0);
+        lower(k, j) = (below <= near) & (step >= below) & (g > 0) & ~newton.at_origin;
+        upper(k, j) = (above <= near) & (-step >= above) & (g < 0) & ~newton.at_origin;
       }
       if (barrier > 0) {
         // A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
@@ -376,13 +387,13 @@ class Riccati {
     return !any(differs);
   }
 
-  void keep(int64_t k, const StageData<T, S>& data, bool sound) {
-    known[k] = sound;
+  void keep(int64_t k, const StageData<T, S>& data, Mask poor) {
     for (int64_t j = 0; j < n.u(); j++) {
       held(k, j) = active[j];
-      known[k] = known[k] && !any(~(data.R(j, j) > kPriced * abs(H(n.x() + j, n.x() + j))));
+      poor |= ~(data.R(j, j) > kPriced * abs(H(n.x() + j, n.x() + j)));
     }
-    result.exact = result.exact && known[k];
+    known[k] = !any(poor);
+    result.exact &= ~poor;
   }
 
   // Curvature that action j has at least, whatever its units.
@@ -497,7 +508,7 @@ class Riccati {
 
   // The linear term of the value function, from the feedforward.
   void linear_value(int64_t k) {
-    by_columns(0, k > 0 ? n.x() : 0, [&](int64_t i, auto kind) {
+    by_columns(0, whole ? n.x() : 0, [&](int64_t i, auto kind) {
       using V = decltype(kind);
       V v = read<V>(linear, i);
       for (int64_t j = 0; j < n.u(); j++) v += read<V>(H[n.x() + j], i) * feedforward(k, j);
@@ -508,7 +519,7 @@ class Riccati {
   // Feedback -H_uu^-1 H_ux, rows of active actions zero, and the value function of stage k; in the adjoint the
   // feedforward too, -H_uu^-1 linear_u, which the solver has from `step_within_bounds`.
   void feedback_law(int64_t k) {
-    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = kAdjoint ? nx + 1 : nx;
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = whole ? 0 : nx, columns = kAdjoint ? nx + 1 : nx;
     linearisation.curvatures(
         0, nw, first, [&](int64_t i) { return i < nx ? i + 1 : nx; },
         [&](int64_t i, int64_t j, auto Y) {
@@ -518,7 +529,7 @@ class Riccati {
     for (int64_t i = 0; i < nu; i++) {
       by_columns(0, nx, [&](int64_t j, auto kind) {
         using V = decltype(kind);
-        write<V>(law[i], j, k == 0 ? V{} : zero_where(active[i], -read<V>(H[nx + i], j)));
+        write<V>(law[i], j, !whole ? V{} : zero_where(active[i], -read<V>(H[nx + i], j)));
       });
       law(i, nx) = select(active[i], all(0), -linear[nx + i]);
     }
@@ -530,7 +541,7 @@ class Riccati {
         t *= L(i, i);
         write<V>(law[i], j, t);
       });
-    if (k > 0) {
+    if (whole) {
       const Value<S> here = value(k);
       for (int64_t i = 0; i < nx; i++) {
         by_columns(0, i + 1, [&](int64_t j, auto kind) {

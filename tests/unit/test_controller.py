@@ -82,14 +82,15 @@ def test_a_copy_begins_anew_and_leaves_the_first_as_it_is(build, reaching, again
             assert np.array_equal(first.step(x, goal), twin.step(x, goal))
 
 
-def test_what_is_kept_without_contact_fits_every_set_of_active_bounds(build):
+def test_what_is_kept_without_contact_fits_every_set_of_active_bounds_and_other_numbers(build):
     mpc = LCSMPCLayer(build.params(0, n_lam=0), build.cost(0), H, -0.3, 0.3)
     controller, active = mpc.controller(), set()
-    for x in 20 * states(12):
+    changes = {"lcs": build.params(1, n_lam=0)}, {"cost": build.cost(1)}, {"u_max": 0.01}, {}, {}
+    for x, change in zip(20 * states(24), itertools.cycle(changes), strict=False):
         controller.reset()
-        controller.step(x)
+        controller.step(x, **change)
         plan = controller.plan
-        assert np.array_equal(plan.u, mpc(torch.from_numpy(x)).u.detach().numpy())
+        assert np.array_equal(plan.u, mpc(torch.from_numpy(x), **change).u.detach().numpy())
         assert plan.status.solved
         active.add((np.abs(plan.u) == 0.3).tobytes())
     assert len(active) > 3
