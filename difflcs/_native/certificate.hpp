@@ -13,6 +13,9 @@ namespace {
 
 // A residual above this may be rounding of s, or hide behind it.
 constexpr double kSure = 2e-7;
+// Up to this residual a quadratic program with bounds alone is measured without the sizes of its states and costates:
+// they only enlarge the scales, so that what is measured is at most this, and no less than the residual.
+constexpr double kBrief = 1e-12;
 
 // Its matrices have an entry for each lane also where the problems share them, so that it is compiled once.
 struct Certificate {
@@ -32,6 +35,7 @@ struct Certificate {
   Mask* rows;
 
   const bool shared;  // the matrices are loaded once, for all problems
+  bool sized;         // the sizes are measured
 
   explicit Certificate(const MpcBatch& b) : batch(b), n(b), shared(shared_matrices(b)) {}
 
@@ -173,12 +177,18 @@ struct Certificate {
       largest_action[j] = all(0);
       for (int64_t k = 0; k < h; k++) largest_action[j] = max(largest_action[j], abs(u[k * nu + j]));
     }
-    worst = poison = all(0);
-    Mask fragile = Mask{};
-    for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - field[kx0][0][i], abs(field[kx0][0][i])}.relative());
-    trajectory();
-    const Mask weak = constraints();
-    costates(fragile);
+    Mask fragile = Mask{}, weak = Mask{}, brief = Mask{};  // brief: the lanes that need no sizes
+    for (sized = nl > 0 || nc > 0 || batch.barrier > 0;; sized = true) {
+      const Vec before = worst;
+      worst = poison = all(0);
+      for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - field[kx0][0][i], abs(field[kx0][0][i])}.relative());
+      trajectory();
+      weak = constraints();
+      costates(fragile);
+      worst = select(brief, before, worst);
+      poison = zero_where(brief, poison);
+      if (sized || !any(~(brief = worst + poison <= kBrief))) break;
+    }
     // The rounding of s may be more than what is left: then it must also hold with the other reading of s.
     const Mask unsure = worst > kSure;
     if (any(unsure)) {
@@ -206,7 +216,7 @@ struct Certificate {
       const Vec* weights = field[kQ_final][0];
       Vec t = field[kq_final][0][i], all_terms = abs(t);
       for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
-      for (int64_t j = 0; j < nx; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);
+      for (int64_t j = 0; j < nx && sized; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);
       for (int64_t m = 0; m < nc; m++) {
         const Vec fine = G_x[m * nx + i] * mu[h * nc + m];
         t += fine;
@@ -238,11 +248,11 @@ struct Certificate {
         if (batch.crossed)
           for (int64_t i = 0; i < nx; i++) {
             g.add(cross[i * nu + j] * xk[i]);
-            whole += abs(cross[i * nu + j] * size[i]);
+            if (sized) whole += abs(cross[i * nu + j] * size[i]);
           }
         for (int64_t i = 0; i < nx; i++) {
           g.add(B[i * nu + j] * p[i]);
-          whole += abs(B[i * nu + j] * p_size[i]);
+          if (sized) whole += abs(B[i * nu + j] * p_size[i]);
         }
         for (int64_t i = 0; i < nl; i++) {
           g.add(E[i * nu + j] * rho[i]);
@@ -259,7 +269,7 @@ struct Certificate {
         using V = decltype(kind);
         SumOf<V> sum{read<V>(pn, i), abs(read<V>(q, i))};
         V along{}, through{}, cost_terms{};
-        for (int64_t j = 0; j < nx; j++) {
+        for (int64_t j = 0; j < nx && sized; j++) {
           const V size_of_a = abs(read<V>(A + j * nx, i));
           cost_terms += abs(read<V>(Q + j * nx, i)) * size[j];
           sum.terms += size_of_a * abs(p[j]);
@@ -300,7 +310,7 @@ struct Certificate {
       const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
       const Vec* size = x_size + k * nx;
       multiply_columns(square(A_t), xk, d, pn);
-      by_columns(0, nx, [&](int64_t i, auto kind) {
+      by_columns(0, sized ? nx : 0, [&](int64_t i, auto kind) {
         using V = decltype(kind);
         V all_terms = abs(read<V>(d, i)), along{};
         for (int64_t j = 0; j < nx; j++) {
@@ -318,7 +328,10 @@ struct Certificate {
         for (int64_t j = 0; j < nu && n.c() > 0; j++) wide += abs(B[i * nu + j] * width(k, j));
         if (n.c() > 0) moved[(k + 1) * nx + i] = wide;
         for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
-        x_size[(k + 1) * nx + i] = max(max(sum.terms, size[i]), kFurther * grown[i]);
+        if (sized)
+          x_size[(k + 1) * nx + i] = max(max(sum.terms, size[i]), kFurther * grown[i]);
+        else
+          sum.terms = abs(sum.value);
         sum.value -= next[i];
         met(sum.relative());
       }

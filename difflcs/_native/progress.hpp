@@ -218,7 +218,7 @@ struct Progress {
   bool exact(const MpcSolve& o, const Sweep& sweep, Vec step) {
     if (kLanes > 1 || needs_rollout[0] || !sweep.exact[0] || sweep.weak[0] || step[0] < 1) return false;
     return inside(reinterpret_cast<const double*>(at.u.entries), 0) && accepted(o, 0, sweep, problem.multiplier) &&
-           o.residual[lane[0].element] <= kMet;
+           o.residual[lane[0].element] <= kBrief;
   }
 
   // A step of the multipliers, at the target of the homotopy: earlier they would follow plans that change.

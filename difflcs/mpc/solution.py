@@ -48,7 +48,7 @@ class MPCSolution:
         status: (...) `Status` as int8.
         iterations: (...) iterations of the solver, int32.
         kkt_residual: (...) largest violation of the optimality conditions by the numbers above, dimensionless; at most
-            1e-6 where an exact backend has solved the plan. See `difflcs.mpc.kkt.residual`.
+            1e-6 where an exact backend has solved the plan. See `kkt.residual`, or a bound of it below 1e-12.
         solve_time: (...) seconds spent on each problem.
         violation: (...) largest violation of a constraint over the stages, soft ones too [its units]; 0 without any.
             For an INFEASIBLE problem it is what remains at a plan that violates as little as possible.
