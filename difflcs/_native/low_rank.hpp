@@ -55,6 +55,8 @@ class LowRank {
 
   // Whether F is of this kind.
   explicit operator bool() const { return rank > 0; }
+  // Whether it is not, of so many forces that they are always alone (search.cpp): some differ much in size from others.
+  bool unlike() const { return most > 0 && rank == 0 && n >= 40; }
 
   // Looks whether system k is of this kind.
   template <class Square, class Wide>
@@ -146,13 +148,8 @@ class LowRank {
       for (int64_t m = 0; m < rank; m++) W_t(m, i) = W(i, m);
     Vec worst = all(0);
     for (int64_t i = 0; i < n; i++) {
-      by_columns(0, n, [&](int64_t j, auto kind) {
-        using V = decltype(kind);
-        V sum = V{} - read<V>(F[i], j);
-        for (int64_t m = 0; m < rank; m++) sum += W(i, m) * read<V>(W_t[m], j);
-        write<V>(left, j, sum);
-      });
-      left[i] += rest[i];
+      for (int64_t j = 0; j < n; j++) right[j] = (i == j ? rest[i] : all(0)) - F(i, j);
+      multiply_columns(W_t, W[i], right, left);
       for (int64_t j = 0; j < n; j++) worst = max(worst, abs(left[j]));
     }
     return !any(worst > kRoundingInSum);
@@ -162,6 +159,9 @@ class LowRank {
   template <class Square, class Wide>
   bool read_rest(const Square& F, const Wide& C) {
     auto basis = scaled;  // orthonormal columns, for the rows of C
+    basis.columns = {0};
+    Vec* none = capacitance;
+    for (int64_t j = 0; j < most; j++) none[j] = all(0);
     int64_t count = 0;
     for (int64_t r = 0; r < C.rows; r++) {
       Vec before = all(0), after = all(0);
@@ -169,34 +169,19 @@ class LowRank {
         left[i] = all(0) + C(r, i);
         before += left[i] * left[i];
       }
-      basis.columns = {count};
       for (int pass = 0; pass < 2; pass++) {
-        by_columns(0, count, [&](int64_t j, auto kind) {
-          using V = decltype(kind);
-          V sum{};
-          for (int64_t i = 0; i < n; i++) sum += left[i] * read<V>(basis[i], j);
-          write<V>(right, j, -sum);
-        });
-        multiply(basis, right, [&](int64_t i) { return left[i]; }, [&](int64_t i, Vec sum) { left[i] = sum; });
+        multiply_columns(basis, left, none, right);
+        multiply(basis, right, [&](int64_t i) { return -left[i]; }, [&](int64_t i, Vec sum) { left[i] = -sum; });
       }
       for (int64_t i = 0; i < n; i++) after += left[i] * left[i];
       if (any(after <= kAnotherRow * kAnotherRow * before)) continue;
       if (count == most) return false;
       for (int64_t i = 0; i < n; i++) basis(i, count) = left[i] / sqrt(after);
-      count++;
+      basis.columns = {++count};
     }
     for (int64_t i = 0; i < n; i++) {
-      by_columns(0, count, [&](int64_t m, auto kind) {
-        using V = decltype(kind);
-        V sum{};
-        for (int64_t j = 0; j < n; j++) sum += (all(0) + F(i, j)) * read<V>(basis[j], m);
-        write<V>(right, m, sum);
-      });
-      Vec across = all(1), own = all(0) + F(i, i);
-      for (int64_t m = 0; m < count; m++) {
-        across -= basis(i, m) * basis(i, m);
-        own -= basis(i, m) * right[m];
-      }
+      multiply_columns(basis, F[i], none, right);
+      const Vec across = all(1) - basis.row(i) * basis[i], own = all(0) + F(i, i) - basis.row(i) * right;
       b[i] = select(across > kAcross, across, all(0));
       rest[i] = select(b[i] > 0, own / across, all(0));
       if (any((b[i] > 0) & (rest[i] < kLeastRest))) return false;
@@ -216,8 +201,7 @@ class LowRank {
         Vec largest = all(kLowRankRounding);
         for (int64_t i = 0; i < n; i++)
           if ((whole || any(b[i] > 0)) && any(remains[i] > largest)) largest = remains[p = i];
-        if (p < 0) return true;
-        if (rank == most) return false;
+        if (p < 0 || rank == most) return p < 0;
         const Vec unit = 1.0 / sqrt(largest);
         W.columns = {rank};
         for (int64_t m = 0; m < rank; m++) right[m] = -W(p, m);
@@ -232,8 +216,7 @@ class LowRank {
         rank++;
       }
     };
-    if (!eliminate(false)) return false;
-    if (!share_rest(F, remains)) return false;
+    if (!eliminate(false) || !share_rest(F, remains)) return false;
     for (int64_t i = 0; i < n; i++) remains[i] = select(b[i] > 0, remains[i], remains[i] - rest[i]);
     if (!eliminate(true)) return false;
     for (int64_t i = 0; i < n; i++) rest[i] += remains[i];

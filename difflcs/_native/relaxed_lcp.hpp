@@ -81,7 +81,10 @@ class RelaxedLcp {
     for (int iteration = 0; iteration < 50; iteration++) {
       magnitude = all(0);
       DIFFLCS_UNROLL
-      for (int64_t i = 0; i < n; i++) magnitude = max(magnitude, abs(lam[i]) + abs(w[i]) + abs(q[i]));
+      for (int64_t i = 0; i < n; i++) {
+        const Vec part = unlike() ? 1.0 + (lam[i] - w[i]) / root[i] : all(1);  // of the rounding of w that g has
+        magnitude = max(magnitude, part * (abs(lam[i]) + abs(w[i]) + abs(q[i])));
+      }
       // Converged at rounding level, or stuck just above it.
       const Vec floor = 1e-15 * magnitude;
       done |= (merit <= floor * floor) | ((merit <= 1e-24 * magnitude * magnitude) & (merit > 0.25 * best)) |
@@ -133,6 +136,13 @@ class RelaxedLcp {
  private:
   bool short_cut() const { return kMayPivot && kLanes == 1 && low_rank && *low_rank; }
 
+  bool unlike() const { return kMayPivot && kLanes == 1 && low_rank && low_rank->unlike(); }
+
+  // g_i without the cancellation that rounds it to the size of the larger number.
+  static Vec exact_g(Vec lam, Vec w, Vec root, Vec eps4) {
+    return any(lam + w <= 0) ? lam + w - root : (4.0 * lam * w - eps4) / (lam + w + root);
+  }
+
   // w, root and the squared norm of g at `next`.
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
@@ -145,7 +155,7 @@ class RelaxedLcp {
     for (int64_t i = 0; i < n; i++) {
       const Vec t = w_next[i], diff = next[i] - t;
       root_next[i] = sqrt(diff * diff + eps4);
-      const Vec g = next[i] + t - root_next[i];
+      const Vec g = unlike() ? exact_g(next[i], t, root_next[i], eps4) : next[i] + t - root_next[i];
       sum += g * g;
     }
     return sum;
@@ -173,7 +183,7 @@ class RelaxedLcp {
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
       const Vec ratio = (lam[i] - w[i]) / root[i], b = 1.0 + ratio;
-      step[i] = root[i] - lam[i] - w[i];
+      step[i] = unlike() ? -exact_g(lam[i], w[i], root[i], eps4) : root[i] - lam[i] - w[i];
       if (short_cut) {
         low_rank->weigh(i, 1.0 - ratio, b);
         continue;

@@ -318,6 +318,15 @@ def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, compl
         torch.testing.assert_close(alone.lam, together.lam[i], rtol=1e-6, atol=1e-6)
 
 
+def test_a_force_of_another_size_does_not_hide_the_others(build):
+    n = build.normal(0)
+    rows, skew, B, c = n(40, 6), 0.3 * n(40, 40), 0.3 * n(6, 3), torch.tensor([*[0.1] * 39, 1e6]).double()
+    F = rows @ rows.mT + 0.01 * torch.eye(40) + skew - skew.mT
+    lcs = LCSParams(torch.eye(6).double(), B, rows.mT.clone(), 0 * n(6), rows, rows @ B, F, c)
+    mpc = LCSMPCLayer(lcs, GoalCost.reach(6, 3, (1.0,) * 6, 0.01), 5, -1.0, 1.0, BatchedBackend(restarts=1), 1e-8)
+    assert mpc.eval()(0 * n(6), 0 * n(6) + 1).iterations < 60
+
+
 def test_iterations_hardly_grow_with_the_horizon():
     cost = GoalCost.reach(8, 1, goal_weight=[5.0] * 4 + [0.5] * 4, input_weight=0.005)
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)
