@@ -45,7 +45,7 @@ constexpr double kReach = 3.0, kNone = 100.0;
 constexpr double kSame = 0.02;
 // So many starts or more are searched in groups of at least this many, each with a local search of its own: what one
 // group ends in depends on where it began, and the best of several is better than one that goes on for longer. An
-// element has no further group if the starts of one agree, or if so many groups end with its best plan.
+// element has no further group once so many groups end with its best plan.
 constexpr int64_t kGroup = 16, kLargestGroup = 2 * kGroup - 1, kAgreed = 3;
 // The homotopy makes one step per stage, and two if a problem is solved again along one that starts at this
 // multiple of the relaxation.
@@ -262,7 +262,6 @@ void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   patience.reserve(batch.count);
   members.reserve(batch.count);
   agreed.reserve(batch.count);
-  unsettled.reserve(batch.count);
   if (starts >= 2 * kGroup) earlier.resize(batch, batch.count);
   origin.reserve(jobs);
 }
@@ -414,7 +413,6 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
       to.iterations[e] += earlier.iterations[e];
       if (!better(to, e, earlier.plans(), e)) copy_plan(n, earlier.plans(), e, to, e);
     }
-    members.swap(unsettled);
     const auto done = [&](int64_t e) { return agreed[e] >= kAgreed; };
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
@@ -475,7 +473,6 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
     live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   }
 
-  unsettled = live;
   finish(batch, guess, effort, out, runner, first);
   improve(batch, effort, out, runner, first, count);
 }

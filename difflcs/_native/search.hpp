@@ -108,8 +108,7 @@ class MpcSearch {
   Store tried, finished, earlier;  // earlier: the plans of earlier groups
   std::vector<double> reached;  // objectives of the starts of each element
   std::vector<int64_t> best;    // of the jobs tried for each element
-  std::vector<int64_t> members, unsettled;    // the elements of a group, and those of them whose starts disagree
-  std::vector<int64_t> agreed;  // how many groups end with the best plan of each element
+  std::vector<int64_t> members, agreed;  // the elements of a group; how many groups end with the best plan of each
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };

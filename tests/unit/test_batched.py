@@ -180,8 +180,7 @@ def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
         plans.append(mpc(x0))
     few, group, groups = plans
     assert (group.iterations == few.iterations).tolist() == [True, False]
-    assert (groups.iterations == few.iterations).tolist() == [True, False]  # the first of three groups ends so
-    assert int(groups.iterations[1]) > int(group.iterations[1])
+    assert (groups.iterations > group.iterations).all()
     assert bool((groups.objective <= group.objective * (1 + 1e-9)).all())
 
 
