@@ -46,7 +46,7 @@ constexpr double kSame = 0.02;
 // So many starts or more are searched in groups of at least this many, each with a local search of its own: what one
 // group ends in depends on where it began, and the best of several is better than one that goes on for longer. An
 // element has no further group once so many groups end with its best plan.
-constexpr int64_t kGroup = 16, kLargestGroup = 2 * kGroup - 1, kAgreed = 3;
+constexpr int64_t kGroup = 16, kLargestGroup = 2 * kGroup - 1, kAgreed = 5;
 // The homotopy makes one step per stage, and two if a problem is solved again along one that starts at this
 // multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;

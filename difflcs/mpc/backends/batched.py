@@ -55,7 +55,7 @@ class BatchedBackend(Backend):
     each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
     for long plans. Of four to seven starts only four of these are tried. From 32 starts on, groups of sixteen are
-    searched so one after the other, until three end with the same plan, and the best plan of all counts.
+    searched so one after the other, until five end with the same plan, and the best plan of all counts.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
