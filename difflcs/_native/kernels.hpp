@@ -30,6 +30,9 @@ struct LcpBatch {
 
 // From these sizes on LCPs are solved one by one, exact and relaxed ones: lanes are faster below, if they are full.
 constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
+// From this number of forces, or of states and actions, on MPC problems are solved one by one: the matrices of several
+// side by side would not fit into the cache. Forces that share few bodies are solved for faster alone, too (low_rank.hpp).
+constexpr int64_t kAloneForces = 40, kAlone = 48;
 
 // Tolerances of a solved LCP, as in difflcs.lcp.solve_lcp.
 constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it

@@ -5,6 +5,7 @@
 // Forces move the state along C, and F - diag(rest) is what contacts feel of that: its rows are sums of rows of C. So
 // what F does across the rows of C is rest alone.
 #pragma once
+#include "kernels.hpp"
 #include "lanes.hpp"
 #include "lu.hpp"
 #include "matrix.hpp"
@@ -55,8 +56,8 @@ class LowRank {
 
   // Whether F is of this kind.
   explicit operator bool() const { return rank > 0; }
-  // Whether it is not, of so many forces that they are always alone (search.cpp): some differ much in size from others.
-  bool unlike() const { return most > 0 && rank == 0 && n >= 40; }
+  // Whether it is not, of so many forces that they are always alone: some differ much in size from others.
+  bool unlike() const { return most > 0 && rank == 0 && n >= kAloneForces; }
 
   // Looks whether system k is of this kind.
   template <class Square, class Wide>

@@ -60,9 +60,6 @@ constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 constexpr double kSoft = 1e-5, kSofter = 1000.0, kSearched = 0.6;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
-// From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
-// by side would not fit into the cache. Forces that share few bodies are solved for faster alone, too (low_rank.hpp).
-constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
