@@ -23,41 +23,55 @@ def outcome(state: Any, action: Any, after: Any, goal: Any, ended: Any) -> tuple
     return -error - 1.0 * (ended & ~success), success
 
 
-class Slide(gymnasium.Env):
-    """The first state moves as told, the others fade."""
+class Reaching(gymnasium.Env):
+    """Base of environments without a simulator whose first state is to reach a goal.
 
-    def __init__(self, size: int = 2):
-        box = spaces.Box
+    Subclasses draw states and goals, move, and judge: reward and success of a transition, see `outcome`.
+    """
+
+    def __init__(self, size: int, u_max: float, length: int, breaks_at: int | None = None):
         self.observation_space = spaces.Dict(
-            state=box(-9.0, 9.0, (size,), np.float64), goal=box(-1.0, 1.0, (1,), np.float64)
+            state=spaces.Box(-10.0, 10.0, (size,), np.float64), goal=spaces.Box(-1.0, 1.0, (1,), np.float64)
         )
-        self.action_space = box(-U_MAX, U_MAX, (1,), np.float64)
-        self.size = size
+        self.action_space = spaces.Box(-u_max, u_max, (1,), np.float64)
+        self.size, self.length, self.breaks_at = size, length, breaks_at
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         super().reset(seed=seed)
-        self.steps, self.state = 0, self.np_random.uniform(-0.1, 0.1, self.size)
-        self.goal = self.np_random.uniform(-0.8, 0.8, 1)
+        self.steps, (self.state, self.goal) = 0, self.draw()
         if options and "goal" in options:
             self.goal = np.array(options["goal"], np.float64)
-        return self._observe(), {"success": False, "position_error": self._error()}
+        return self.observe(), {"success": False, "position_error": self.error()}
 
     def step(self, action: np.ndarray):
-        before, self.state = self.state, self.move(action)
+        before, self.state = self.state, self.move(np.asarray(action))
         self.steps += 1
-        ended = self.steps == STEPS
-        reward, success = outcome(before, action, self.state, self.goal, ended)
-        return self._observe(), float(reward), False, ended, {"success": bool(success), "position_error": self._error()}
+        ended, broken = self.steps == self.length, self.steps == self.breaks_at
+        reward, success = self.judge(before, action, self.state, self.goal, ended)
+        info = {"success": bool(success), "position_error": self.error(), "physics_error": broken}
+        return self.observe(), float(reward), False, ended or broken, info
+
+    def error(self) -> float:
+        return float(abs(self.state[0] - self.goal[0]))
+
+    def observe(self) -> dict[str, np.ndarray]:
+        return {"state": self.state.copy(), "goal": self.goal.copy()}
+
+
+class Slide(Reaching):
+    """The first state moves as told, the others fade."""
+
+    judge = staticmethod(outcome)
+
+    def __init__(self, size: int = 2):
+        super().__init__(size, U_MAX, STEPS)
+
+    def draw(self):
+        return self.np_random.uniform(-0.1, 0.1, self.size), self.np_random.uniform(-0.8, 0.8, 1)
 
     def move(self, action: np.ndarray) -> np.ndarray:
         """Return the next state."""
         return np.append(self.state[:1] + action, 0.5 * self.state[1:])
-
-    def _error(self) -> float:
-        return float(abs(self.state[0] - self.goal[0]))
-
-    def _observe(self) -> dict[str, np.ndarray]:
-        return {"state": self.state.copy(), "goal": self.goal.copy()}
 
 
 def features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:

@@ -2,13 +2,12 @@
 
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 from difflcs import LCSParams, solve_lcp
+from tests.conformance.toy import Reaching
 
 STEPS = 10
 U_MAX = 0.1
@@ -28,38 +27,25 @@ def pusher() -> LCSParams:
     )
 
 
-class PusherEnv(gymnasium.Env):
+class PusherEnv(Reaching):
     """Push the block to a goal ahead of it."""
 
-    observation_space = spaces.Dict(
-        {key: spaces.Box(-10.0, 10.0, (size,), np.float64) for key, size in (("state", 2), ("goal", 1))}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
-
     def __init__(self, breaks_at: int | None = None, length: int = STEPS):
-        self.breaks_at, self.length = breaks_at, length
+        super().__init__(2, U_MAX, length, breaks_at)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        self.state = self.np_random.uniform([0.05, -0.1], [0.15, 0.0])
-        self.goal = self.np_random.uniform([0.2], [0.5])
-        return self._observation(), {}
+    def draw(self):
+        return self.np_random.uniform([0.05, -0.1], [0.15, 0.0]), self.np_random.uniform([0.2], [0.5])
 
-    def step(self, action):
-        params, x, u = pusher(), torch.from_numpy(self.state), torch.from_numpy(np.asarray(action))
+    def move(self, action):
+        params, x, u = pusher(), torch.from_numpy(self.state), torch.from_numpy(action)
         lam = solve_lcp(params.F, params.gap(x, u)).lam
-        self.state = params.next_state(x, u, lam).numpy()
-        self.steps += 1
-        broken = self.steps == self.breaks_at
-        if broken:
-            self.state = np.full(2, np.nan)
-        error = abs(float(self.state[0] - self.goal[0]))
-        info = {"success": error < 0.02, "position_error": error, "physics_error": broken}
-        return self._observation(), -error, False, self.steps >= self.length or broken, info
+        broken = self.steps + 1 == self.breaks_at
+        return np.full(2, np.nan) if broken else params.next_state(x, u, lam).numpy()
 
-    def _observation(self):
-        return {"state": self.state.copy(), "goal": self.goal.copy()}
+    @staticmethod
+    def judge(state, action, after, goal, ended):
+        error = abs(after[0] - goal[0])
+        return -error, error < 0.02
 
 
 def make_envs(count: int, **kwargs) -> SyncVectorEnv:

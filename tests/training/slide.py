@@ -1,9 +1,9 @@
 """A small pushing system that needs no simulator, also one with a context, and trainers on it."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -17,6 +17,7 @@ from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.policy import GaussianPolicy, make_actor
 from difflcs.rl.learning.ppo import PPO
+from tests.conformance.toy import Reaching
 
 STEPS = 6
 U_MAX = 0.1
@@ -24,57 +25,46 @@ ROLLOUTS = 12
 PENALTY = 10.0
 
 
-class Slide(gymnasium.Env):
+def outcome(state, action, after, goal, ended, penalty=PENALTY):
+    """Reward and success of a transition; also for model rollouts."""
+    success = abs(after - goal)[..., 0] < 0.05
+    return -20 * abs(state - goal)[..., 0] - penalty * (ended & ~success), success
+
+
+class Slide(Reaching):
     """x₊ = x + gain·u: what a model with another B must find out."""
 
-    observation_space = spaces.Dict(
-        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
-
     def __init__(self, breaks_at: int | None = None, penalty: float = PENALTY):
-        self.breaks_at, self.penalty = breaks_at, penalty
+        super().__init__(1, U_MAX, STEPS, breaks_at)
+        self.judge = partial(outcome, penalty=penalty)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
+    def draw(self):
+        return np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
 
-    def step(self, action):
-        error = float(abs(self.state - self.goal)[0])
-        self.state = self.state + 0.5 * np.asarray(action)
-        self.steps += 1
-        broken = self.steps == self.breaks_at
-        success = float(abs(self.state - self.goal)[0]) < 0.05
-        last = self.steps >= STEPS
-        info = {"success": success, "physics_error": broken}
-        reward = -20 * error - self.penalty * (last and not success)
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last or broken, info
+    def move(self, action):
+        return self.state + 0.5 * action
 
 
 class Gains(Slide):
     """`Slide` with another start and another gain in each episode, which is known: x₊ = x + gain·u."""
 
-    observation_space = spaces.Dict(
-        {
-            key: spaces.Box(low, high, (1,), np.float64)
-            for key, low, high in (("state", -10.0, 10.0), ("goal", -1.0, 1.0), ("context", 0.0, 1.0))
-        }
-    )
-
     def __init__(self, drifts: bool = False):
         super().__init__()
+        self.observation_space["context"] = spaces.Box(0.0, 1.0, (1,), np.float64)
         self.drifts = drifts
 
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed)
-        self.state, self.context = self.np_random.uniform(-0.1, 0.1, 1), self.np_random.uniform(0.2, 0.8, 1)
-        return {**observation, "state": self.state.copy(), "context": self.context.copy()}, info
+    def draw(self):
+        _, goal = super().draw()
+        state, self.context = self.np_random.uniform(-0.1, 0.1, 1), self.np_random.uniform(0.2, 0.8, 1)
+        return state, goal
 
-    def step(self, action):
-        observation, *rest = super().step(np.asarray(action) * self.context / 0.5)
+    def move(self, action):
+        after = super().move(action * self.context / 0.5)
         self.context = self.context + 0.01 * self.drifts
-        return {**observation, "context": self.context.copy()}, *rest
+        return after
+
+    def observe(self):
+        return {**super().observe(), "context": self.context.copy()}
 
 
 class Gain(nn.Module):
@@ -93,12 +83,6 @@ class Gain(nn.Module):
         assert context is not None
         A, B, one = self.a.view(1, 1), (self.effect * context).unsqueeze(-1), torch.ones(1, dtype=torch.float64)
         return LCSParams(A=A, B=B, C=one[None], d=0 * one, D=A, E=B, F=1.5 * one[None], c=-self.wall * one)
-
-
-def outcome(state, action, after, goal, ended):
-    """`Slide`'s, for model rollouts."""
-    success = abs(after - goal)[..., 0] < 0.05
-    return -20 * abs(state - goal)[..., 0] - PENALTY * (ended & ~success), success
 
 
 def features(state, goal, elapsed):
