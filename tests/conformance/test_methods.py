@@ -225,7 +225,7 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
 
 
 def test_states_with_anything_wrong_are_refused_and_change_nothing(name, make_trainer):
-    """What `check_state` refuses: tests/unit/test_state_tree.py."""
+    """What `check_state` refuses: tests/unit/test_checkpoint.py."""
     trainer = make_trainer(name)
     trainer.step()
     before = copy_state(trainer.state_dict())

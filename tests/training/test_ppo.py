@@ -1,13 +1,20 @@
-"""PPO through the MPC, on a small pushing system that needs no simulator: the trainer, and parts handed to it."""
+"""PPO through the MPC, on a small pushing system that needs no simulator: alone, on model rollouts, after a warm-up."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
 
-from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl import CriticSettings, Epochs, Natural
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError
+from difflcs.rl import LCSRL, CriticSettings, Epochs, Natural, Rollouts, Warmup, WarmupSettings
+from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.rollout import elapsed_fractions
+from difflcs.rl.learning.policy import make_actor
+from difflcs.rl.learning.ppo import PPO
+from difflcs.rl.learning.state_tree import copy_state
+from difflcs.rl.rollout import collect, elapsed_fractions, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
 from tests.conftest import refuse
 from tests.training import slide
@@ -184,3 +191,214 @@ def test_load_refuses_what_does_not_fit():
     for places in (episodes["iteration"][1:], episodes["iteration"] + 1, torch.arange(slide.ROLLOUTS)):
         critic = {**state["critic"], "episodes": {**episodes, "iteration": places}}
         refuse(CheckpointError, "iteration", trainer.load, {**state, "critic": critic})
+
+
+# --- model rollouts ---------------------------------------------------------------------------------------------------
+
+
+def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
+    return slide.make_ppo(seed, models=slide.make_models(seed, first_epochs, **(models or {})), **changes)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "last", "remembered", "expected"),
+    [
+        (2, 0, False, [0, 2, 2, 2]),  # none before the first real episodes
+        (2, 0, True, [2, 2, 2, 2]),  # but where those of a warm-up are known
+        (2, 3, True, [2, 2, 2, 8]),  # and three times as many after the last
+        (0, 3, True, [0, 0, 0, 0]),
+    ],
+)
+def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, last, remembered, expected):
+    trainer, counts = make_practising(models={"iterations": iterations, "last": last}), []
+    if remembered:
+        env = slide.make_envs(3)
+        trainer.remember(collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2, 3], slide.STEPS))
+    seen = slide.recorded(trainer, "practice")
+    while not trainer.done:
+        before = len(seen.calls)
+        report = trainer.step()
+        counts.append(len(seen.calls) - before)
+        assert (report.model_success is None) == (report.model_loss is None) == (counts[-1] == 0)
+    assert counts == expected
+
+
+def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
+    models = {"iterations": 2, "real_step": 0.25, "steps": 1}
+    trainer = make_practising(models=models, final_step=1.0, steps=1)
+    trainer.update = slide.Noting(trainer.update)
+    sizes = iter([1.0, 2.0, 3.0, 21.0])  # whatever the real episodes say
+    trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
+    for _ in range(2):
+        report = trainer.step()
+    assert [scale for _, scale in trainer.update.seen] == [0.25, 1.0, 1.0, 0.25]
+    assert trainer.update.size.value == 3.0 == report.learning_rate
+
+
+def test_real_episodes_are_tested_once():
+    trainer, sizes = make_practising(models={"iterations": 1, "steps": 1}, steps=1, gain=-3.0), []
+    challenge = trainer.incumbent.challenge
+    trainer.incumbent.challenge = lambda starts, *rest: sizes.append(len(starts)) or challenge(starts, *rest)
+    for _ in range(2):
+        trainer.step()
+    assert sizes == [slide.ROLLOUTS, slide.ROLLOUTS]
+
+
+def success(trainer) -> float:
+    while not trainer.done:
+        trainer.step()
+    return evaluate(slide.make_envs(60), trainer.policy, 60, 0, slide.STEPS).success_rate
+
+
+SHORT = {"target_kl": 0.02}
+"""Short steps: with the usual ones rounding decides in one training of twelve whether a late step ruins it."""
+
+
+def test_model_rollouts_learn_from_less_data():
+    models = {"iterations": 6, "rollouts": 30, "actions": 8}
+    both = sum(success(make_practising(seed, 100, models, **SHORT)) for seed in range(2)) / 2
+    assert both > sum(success(slide.make_ppo(seed, **SHORT)) for seed in range(2)) / 2 + 0.15
+
+
+def test_iterations_on_model_rollouts_have_an_effort_of_their_own():
+    trainer = make_practising(
+        models={"iterations": 1, "rollouts": 6, "steps": 5, "value_epochs": 2}, minibatch=slide.STEPS * 4
+    )
+    trainer.step()
+    batches, epochs = [], []
+    trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: batches.append(len(inputs[0])))
+    learn = trainer.critic.learn
+    trainer.critic.learn = lambda *arguments: (epochs.append(arguments[-1]), learn(*arguments))
+    trainer.step()
+    steps, size = slide.STEPS, slide.STEPS * 4
+    played = [6] * steps + [6 * steps] + [size, 12, size, 12, size]  # in lockstep, the metric, gradient steps
+    real = [slide.ROLLOUTS] * steps + [slide.ROLLOUTS * steps] + [size] * 4
+    assert batches == played + real
+    assert epochs == [2, 3]
+
+
+@pytest.mark.parametrize("actions", [1, 4])
+def test_the_value_network_learns_from_what_the_estimator_says(actions):
+    """From rewards without the action advantage in model rollouts, from real ones as they are."""
+    trainer = make_practising(models={"iterations": 1, "actions": actions})
+    seen = [slide.recorded(trainer, "robot"), slide.recorded(trainer, "practice")]
+    for _ in range(2):
+        trainer.step()
+    (_, _, rewards, _), estimate = seen[1].calls[0], seen[1].results[0]
+    assert estimate.samples.batch_size == (10, slide.STEPS, actions)
+    torch.testing.assert_close(trainer.critic.history[1][1], estimate.rewards, rtol=0, atol=0)
+    assert torch.equal(estimate.rewards, rewards) == (actions == 1)
+    assert torch.equal(trainer.critic.history[2][1], seen[0].calls[1][2])
+
+
+def test_a_state_without_models_is_refused():
+    trainer = slide.make_ppo()
+    trainer.step()
+    refuse(CheckpointError, r"models.*other settings", make_practising().load, trainer.state_dict())
+    refuse(CheckpointError, r"models.*other settings", trainer.load, make_practising().state_dict())
+
+
+# --- after a warm-up --------------------------------------------------------------------------------------------------
+
+
+def make_lcsrl(models: bool = False, **changes) -> LCSRL:
+    lcs = slide.make_model()
+    mpc = slide.make_mpc(lcs)
+    settings = WarmupSettings(rollouts=Rollouts(first=2, each=3), noise=0.02, epochs=Epochs(3, 2, 8))
+    warmup, envs = Warmup(lcs, mpc, slide.make_envs(3), settings, 0, slide.STEPS), slide.make_envs()
+
+    def make_main(first_episode: int, first_iteration: int) -> PPO:
+        options = {"first_episode": first_episode, "first_iteration": first_iteration}
+        options["total_episodes"] = 8 + 2 * slide.ROLLOUTS
+        rollouts = slide.make_models(0, 2, iterations=1, rollouts=5) if models else None
+        return slide.make_ppo(0, env=envs, models=rollouts, controller=mpc, options=options, **changes)
+
+    return LCSRL(warmup, 8 * slide.STEPS, make_main)
+
+
+def test_phases_follow_each_other():
+    trainer = make_lcsrl()
+    reports = [trainer.step() for _ in range(5)]
+    assert [type(report).__name__ for report in reports] == ["WarmupReport"] * 3 + ["PPOReport"] * 2
+    assert [report.iteration for report in reports] == [1, 2, 3, 4, 5]
+    assert [report.env_steps for report in reports] == [
+        slide.STEPS * n for n in (2, 5, 8, 8 + slide.ROLLOUTS, 8 + 2 * slide.ROLLOUTS)
+    ]
+
+
+def test_episodes_of_both_phases_differ():
+    """The main phase goes on in the stream of the warm-up, where that has ended."""
+    trainer, seeds = make_lcsrl(), []
+    for _ in range(5):
+        env = trainer.current.env if isinstance(trainer.current, Warmup) else trainer.current.robot.env
+        count, reset = trainer.episodes, env.reset
+        env.reset = lambda reset=reset, **options: (seeds.append(options["seed"]), reset(**options))[1]
+        trainer.step()
+        del env.reset
+        seeds[-1] = seeds[-1][: trainer.episodes - count]
+    flat = [seed for part in seeds for seed in part]
+    assert len(set(flat)) == len(flat) == 8 + 2 * slide.ROLLOUTS
+
+
+def test_a_trainer_goes_back_to_a_phase():
+    """A state of either phase can be loaded in either phase."""
+    trainer = make_lcsrl()
+    trainer.step()
+    early = copy_state(trainer.state_dict())
+    for _ in range(3):
+        trainer.step()
+    late, state = slide.parameters(trainer), copy_state(trainer.state_dict())
+    trainer.load(early)
+    assert isinstance(trainer.current, Warmup)
+    assert (trainer.iteration, trainer.env_steps) == (1, 2 * slide.STEPS)
+    trainer.load(state)
+    assert isinstance(trainer.current, PPO)
+    assert slide.same(late, slide.parameters(trainer))
+
+
+def test_the_main_phase_remembers_the_warm_up():
+    trainer = make_lcsrl(models=True)
+    for _ in range(3):
+        trainer.step()
+    assert len(trainer.current.models) == 8
+    trainer.step()
+    assert len(trainer.current.models) == 8 + slide.ROLLOUTS
+
+
+def test_what_is_handed_out_is_bounded_on_states_of_the_warm_up():
+    """Inside its episodes: PPO takes no step on these states, and model rollouts do not start there."""
+    trainer, seen = make_lcsrl(models=True, gain=-3.0), []
+    for _ in range(3):
+        trainer.step()
+    inside, incumbent = trainer.current.models.episodes["state"][:, 1:].unique(), trainer.current.incumbent
+    follow = incumbent.follow
+    incumbent.follow = lambda model, held_out: (seen.append(held_out), follow(model, held_out))
+    for _ in range(2):
+        trainer.step()
+    assert all(bool(torch.isin(one["state"], inside).all()) for one in seen)
+    assert len(seen[0]["state"].unique()) == len(inside)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+def test_bad_arguments_are_refused():
+    options = {"features": slide.features, "total_episodes": 20, "episode_steps": slide.STEPS}
+    env, mpc, settings = slide.make_envs(), slide.make_mpc(slide.make_model()), slide.small_settings()
+    actor, make = make_actor(mpc, settings.std), ppo_settings.make_ppo
+    fixed = make_actor(slide.make_mpc(mpc.lcs.params().detach()), settings.std)
+    few, alone, diagonal = slide.make_envs(3), env.envs[0], replace(settings, covariance="diagonal")
+    refuse(InvalidInputError, "at least 12 environments, got 3", make, actor, few, settings, 0, **options)
+    refuse(InvalidInputError, "use an LCSModel", make, fixed, env, settings, 0, **options)
+    refuse(InvalidInputError, "covariance='diagonal'", make, actor, env, diagonal, 0, **options)
+    refuse(InvalidInputError, "shorten the warm-up", make, actor, env, settings, 0, **options, first_episode=20)
+    refuse(DTypeError, r"use LCSMPCPolicy\(", make, mpc, env, settings, 0, **options)
+    refuse(InvalidInputError, "env: expected a VectorEnv", make, actor, alone, settings, 0, **options)
+    ppo = make(actor, env, settings, 0, **options | {"features": lambda *seen: slide.features(*seen) / 0})
+    refuse(NonFiniteError, "features: expected finite", ppo.step)
+    refuse(InvalidInputError, "std_range", replace, settings, std_range=(0.2, 0.1))
+    bound = torch.full((1,), slide.U_MAX)
+    network = make_actor(MLPController(slide.features, 3, -bound, bound, 4, slide.STEPS), settings.std)
+    for changes in ({}, {"update": "adam", "beta": 0.5}):
+        refuse(InvalidInputError, "without an LCS", make, network, env, replace(settings, **changes), 0, **options)
+    make(network, env, replace(settings, update="adam"), 0, **options)

@@ -1,19 +1,25 @@
-"""The stochastic policy as a TorchRL actor, on the small pushing system of `conftest`."""
+"""Policies of PPO: a stochastic one around the MPC as a TorchRL actor, its Jacobian, and a network in its place."""
 
 import math
 
 import pytest
 import torch
+from mujoco import MjModel
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torch.autograd.function import once_differentiable
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from difflcs import GoalCost, LCSMPCLayer
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.physics import ContactLCS, PlanarPushing, box
+from difflcs.physics.mujoco import LearnableMujocoLCS
+from difflcs.rl.learning import jacobian
+from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import LCSMPCPolicy
-from tests.conftest import refuse
+from tests.conftest import F64, refuse
+from tests.training.slide import STEPS, U_MAX, features
 
-U_MAX = 0.1
 STD = 0.02
 
 
@@ -107,3 +113,99 @@ def test_what_is_learned(mpc):
 )
 def test_bad_arguments(mpc, arguments, error, message):
     refuse(error, message, LCSMPCPolicy, **{"mpc": mpc, **arguments})
+
+
+# --- the Jacobian of the mean -----------------------------------------------------------------------------------------
+
+
+RAIL = """<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0" damping=".5"/>
+  <geom size=".1"/></body></worldbody><actuator><motor joint="rail" gear="40"/></actuator></mujoco>"""
+LEARN = ("center_of_mass", "gyration", "friction", "radius")
+
+
+class Once(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value):
+        return value.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        return grad
+
+
+class Stubborn(ContactLCS):
+    """With a part that cannot be differentiated twice."""
+
+    def params(self, x=None, context=None):
+        system = super().params(x, context)
+        return type(system)(**{**system.tensors(), "c": Once.apply(system.c)})
+
+
+@pytest.mark.parametrize("kind", [ContactLCS, Stubborn])
+def test_forwards_and_backwards_agree(build, kind, monkeypatch):
+    system = PlanarPushing(box(-0.5, 0.5, -0.5, 0.5), 0.2, friction=0.3, compliance=0.1)
+    cost = GoalCost.reach(5, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(5.0, 5.0, 1.5), input_weight=0.01)
+    goal = torch.tensor([0.3, 0.1, 0.2], dtype=F64).expand(40, 3)
+    mpc = LCSMPCLayer(kind(system, LEARN), cost, 3, -0.2, 0.2, relaxation=1e-3)
+    x = 0.1 * build.normal(0)(40, 5)
+    x[:, 3] -= 0.7
+    found = []
+    for few in (jacobian.FEW_PARAMETERS, 0):
+        monkeypatch.setattr(jacobian, "FEW_PARAMETERS", few)
+        found.append(jacobian.system_jacobian(mpc, x, goal, None, None))
+    torch.testing.assert_close(found[0], found[1])
+    assert found[0].shape == (40, 2, 5)
+    assert bool((found[0].abs().amax((0, 1)) > 1e-6).all())
+
+
+def test_a_mujoco_model_by_differences_and_backwards_agree(monkeypatch):
+    learned = LearnableMujocoLCS(MjModel.from_xml_string(RAIL), learn=["mass", "gain"], motion="dynamic", seconds=0.1)
+    cost = GoalCost.reach(2, 1, goal_weight=(1.0,), goal_weight_final=(5.0,), input_weight=0.01)
+    mpc = LCSMPCLayer(learned, cost, 3, -20.0, 20.0, relaxation=1e-3)
+    at = torch.linspace(-0.1, 0.1, 6, dtype=F64).view(3, 2), torch.full((3, 1), 0.2, dtype=F64), None, None
+    by_differences = jacobian.system_jacobian(mpc, *at)
+    monkeypatch.delattr(LearnableMujocoLCS, "slopes_along")
+    torch.testing.assert_close(by_differences, jacobian.system_jacobian(mpc, *at))
+    assert by_differences.abs().min() > 1e-4
+
+
+# --- a network instead of the MPC -------------------------------------------------------------------------------------
+
+
+BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
+
+
+def make_network() -> MLPController:
+    return MLPController(features, 3, -BOUND, BOUND, 16, STEPS, torch.Generator().manual_seed(0))
+
+
+def test_actions_stay_within_the_bounds_and_depend_on_the_time():
+    network = make_network()
+    with torch.no_grad():
+        network.layers[-2].weight.mul_(300)
+    state, goal = torch.randn(50, 1).double(), torch.randn(50, 1).double()
+    first = network(state, goal)
+    assert bool((first.action.abs() <= U_MAX).all())
+    assert float(first.action.detach().abs().max()) > 0.9 * U_MAX
+    assert bool(first.converged.all())
+    actions = [network(state, goal).action for _ in range(STEPS)]
+    assert not torch.equal(actions[0], first.action)
+    assert torch.equal(actions[-1], first.action)  # the next episode
+    network.begin()
+    assert torch.equal(network(state, goal).action, first.action)
+    tight = network(state, goal, u_min=-0.01 * BOUND, u_max=0.01 * BOUND)
+    assert bool((tight.action.abs() <= 0.01 * U_MAX).all())
+
+
+def test_it_starts_near_the_middle_of_the_bounds():
+    low = torch.tensor([0.1, -0.3], dtype=torch.float64)
+    network = MLPController(features, 3, low, low + 0.2)
+    state = torch.randn(50, 1).double()
+    torch.testing.assert_close(network(state, -state).action, (low + 0.1).expand(50, 2), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("config", [{}, {"n_features": 3, "width": 0, "episode_steps": STEPS}])
+def test_sizes_that_make_no_network_are_refused(config):
+    with pytest.raises(CheckpointError, match="expected a network written by difflcs"):
+        MLPController.from_config(config, make_network().state_dict(), "here", features)
