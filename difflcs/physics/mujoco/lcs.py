@@ -367,11 +367,13 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     ends, usual = torch.from_numpy(of._actuators.range)[:, None] - zero, torch.from_numpy(of._actuators.usual)
     other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
+    bounds = torch.stack(of.action_bounds(x))  # which say how far such a servo goes, where a metre has too much force
+    likely = torch.where((usual > 0) | (bounds.abs() > 1), likely, bounds)
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
     turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
-    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*of.action_bounds(x))
+    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*bounds)
     m, nv = len(u), of.state.nv
     ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
     states = np.tile(read.states[some], (m, 1))
