@@ -154,14 +154,14 @@ def test_an_action_against_an_equality_constraint_that_is_far_from_held_does_wha
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
 def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     model = load(
-        BAR.format("a", 0, "") + BAR.format("c", 2, ""),
-        '<equality><joint joint1="c" joint2="a" polycoef=".1 -2 0 0 0"/></equality>'
-        '<actuator><position joint="a" kp="3000" kv="20"/></actuator>',
+        BAR.format("a", 0, "") + BAR.format("c", 2, LINK.replace("/>", ' range="-90 90"/>', 1)),
+        '<equality><joint joint1="c" joint2="a" polycoef=".1 -2 0 0 0"/><joint joint1="b" joint2="c"/></equality>'
+        '<actuator><position joint="a" kp="30000" kv="200"/></actuator>',
     )
-    module, x = MujocoLCS(model, motion=motion), torch.tensor([0.1, 0.05]).double()
-    after = module.params(x).step(x, torch.tensor([0.2]).double()).x_next
-    assert abs(after[0] - 0.3) < 1e-2
-    assert abs(after[1] - 0.1 + 2 * after[0]) < 1e-9
+    module, x = MujocoLCS(model, motion=motion), 0.1 * torch.rand(50, 3, dtype=torch.float64)
+    after = module.params(x).step(x, torch.full((50, 1), 0.2).double()).x_next
+    assert (after[:, 0] - x[:, 0] - 0.2).abs().max() < 1e-2
+    assert (after[:, 1] - 0.1 + 2 * after[:, 0]).abs().max() < 1e-9
 
 
 def test_what_is_driven_in_quasi_static_motion_stops_at_the_limits_of_its_joint():

@@ -18,6 +18,7 @@ from difflcs.physics.mujoco.native import copy_taken, flags, native
 
 Array = NDArray[np.float64]
 _FIRMEST = 1e-8  # least R, in parts of what it stands beside
+_ROUNDING = 1e-12  # part of the response without constraints, up to which something does not move
 _DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
 
 
@@ -103,7 +104,9 @@ class Equality:
         along = np.eye(x.shape[1]) - by @ E
         back = by @ ((E @ x[:, :, None])[:, :, 0] - rows.gap)[:, :, None]
         d = (along @ d[..., None] + back)[:, :, 0]
-        matrices = along @ A, along @ B, d, along @ response
+        held = along @ response
+        moves = np.diagonal(held, axis1=1, axis2=2) > _ROUNDING * np.trace(response, axis1=-2, axis2=-1)[..., None]
+        matrices = along @ A, along @ B, d, held * moves[:, None] * moves[:, :, None]
         return FreeMotion(*matrices)
 
 
