@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import tyro
+from models import diagonal, uniform
 from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
@@ -68,14 +69,11 @@ class Case:
 
 def cart_pole(horizon: int, count: int, seed: int) -> Case:
     """Make a cart-pole to balance upright between two walls, from starts at which the tip touches one or not."""
-    generator = torch.Generator().manual_seed(seed)
-    weight = torch.diag(torch.tensor([10.0, 50.0, 1.0, 1.0], dtype=torch.float64))
-    cost = QuadraticCost(weight, torch.eye(1, dtype=torch.float64), 5 * weight)
+    weight = diagonal(10, 50, 1, 1)
+    cost = QuadraticCost(weight, diagonal(1), 5 * weight)
     lcs = cart_pole_between_walls()
     mpc = LCSMPCLayer(LCSModel.from_params(lcs), cost, horizon, -10.0, 10.0, on_failure="mask").eval()
-    size = torch.tensor([0.05, 0.1, 0.2, 0.2], dtype=torch.float64)
-    starts = size * (2 * torch.rand(count, 4, generator=generator, dtype=torch.float64) - 1)
-    return Case(mpc, lcs, starts, None, 2e-3)
+    return Case(mpc, lcs, uniform([0.05, 0.1, 0.2, 0.2], count, seed), None, 2e-3)
 
 
 def cube(horizon: int, count: int, seed: int) -> Case:

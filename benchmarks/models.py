@@ -44,7 +44,7 @@ def push_the_last_cart(carts: int, horizon: int, others: float = 0.0) -> Quadrat
     q[carts - 1] = -0.3 * 10.0
     missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
     Q = torch.diag(weight)
-    return QuadraticCost(Q, _diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
+    return QuadraticCost(Q, diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ def uniform(size: list[float], count: int, seed: int) -> Tensor:
     return half * (2 * torch.rand(count, len(size), generator=generator, dtype=torch.float64) - 1)
 
 
-def _diagonal(*weights: float) -> Tensor:
+def diagonal(*weights: float) -> Tensor:
+    """Make a diagonal matrix."""
     return torch.diag(torch.tensor(weights, dtype=torch.float64))
 
 
@@ -87,7 +88,7 @@ def to_rest(lcs: LCSParams, horizon: int, count: int, seed: int, final: float = 
 def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instance:
     """Make a cart-pole that stays upright, or leans on a wall."""
     lcs = cart_pole_between_walls(dt=dt, wall_stiffness=stiffness)
-    cost = QuadraticCost(_diagonal(1, 1, 0.1, 0.1), _diagonal(0.01), _diagonal(100, 100, 1, 1))
+    cost = QuadraticCost(diagonal(1, 1, 0.1, 0.1), diagonal(0.01), diagonal(100, 100, 1, 1))
     x0 = uniform([0.02, 0.05, 0.1, 0.3], count, horizon)
     return make(lcs, cost, horizon, 10.0, x0)
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from race_global import hard_cost
-from race_problems import as_mpc, with_contact
+from race_problems import as_mpc, hard_cost, with_contact
 from rivals import admm, impact, layer, sampling
 from rivals.problem import Problem, execute
 from rivals.run import cpu

@@ -14,7 +14,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from race_global import hard_cost
 from race_hard import MODULES, Draw, draws, sampled
 from race_hard import TUNED as TUNED_PLANS
-from rivals.problem import Problem
+from race_problems import hard_cost
+from rivals.problem import INPUTS, Problem
 from rivals.run import cpu
 from rivals.sampling import Solver as Sampling
 from torch import Tensor
@@ -121,8 +121,7 @@ class Planner(Backend):
 
     def prepare(self, problem: MPCProblem) -> None:
         """Make the solver, or keep the last one if only the state is new."""
-        names = [f.name for f in fields(Problem) if f.name not in ("horizon", "relaxation", "constant", "weight")]
-        arrays = {name: getattr(problem, name).numpy().copy() for name in names}
+        arrays = {name: getattr(problem, name).numpy().copy() for name in INPUTS}
         x0, last = arrays.pop("x0"), None if self.solver is None else self.solver.problem
         if last is not None and all(np.array_equal(value, getattr(last, name)) for name, value in arrays.items()):
             last.x0 = x0

@@ -2,15 +2,16 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
-from models import Instance, chain_of_carts, make, pushing_model, uniform
+from models import Instance, chain_of_carts, diagonal, make, pushing_model, uniform
 from models import chain as chain_instance
 from models import pushing as pushing_instance
-from rivals.problem import Problem
+from rivals.problem import INPUTS, Problem
 
-from difflcs import LCSModel, LCSParams, QuadraticCost
+from difflcs import LCSModel, LCSParams, QuadraticCost, solve_lcp
 from difflcs.mpc.problem import MPCProblem
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
@@ -33,15 +34,21 @@ def problem(instance: Instance, seed: int) -> Problem:
     )  # fmt: skip
 
 
-def as_mpc(problem: Problem, few: slice | None = None) -> MPCProblem:
-    """Convert the problem, or some of its elements, to an `MPCProblem`."""
-    data = {}
-    for name in ("A", "B", "C", "d", "D", "E", "F", "c", "Q", "R", "Q_final", "q", "r", "q_final", "u_min", "u_max"):
-        value = torch.from_numpy(np.ascontiguousarray(getattr(problem, name)))
-        rank = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
-        data[name] = value[few] if few is not None and value.ndim > rank else value
-    x0 = torch.from_numpy(problem.x0 if few is None else problem.x0[few])
-    return MPCProblem(**data, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
+def as_mpc(problem: Problem, few: int | None = None) -> MPCProblem:
+    """Convert the problem, or its first few elements, to an `MPCProblem`."""
+    data: dict[str, Any] = {name: torch.from_numpy(np.ascontiguousarray(getattr(problem, name))) for name in INPUTS}
+    mpc = MPCProblem(**data, horizon=problem.horizon, relaxation=problem.relaxation)
+    return mpc if few is None else mpc.select(torch.arange(few))
+
+
+def hard_cost(mpc: MPCProblem, u: torch.Tensor) -> torch.Tensor:
+    """Compute the cost (count,) of executing actions with λ·s = 0."""
+    states = [mpc.x0]
+    for k in range(mpc.horizon):
+        stage = mpc.stage(k)
+        lam = solve_lcp(stage.F, stage.gap(states[-1], u[:, k])).lam
+        states.append(stage.next_state(states[-1], u[:, k], lam))
+    return mpc.objective(torch.stack(states, 1), u)
 
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
@@ -51,8 +58,8 @@ def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
 
 def cart_pole(count: int, horizon: int, seed: int) -> Problem:
     """Make the cart-pole between soft walls, pushed with up to 20 N."""
-    weight = torch.diag(torch.tensor([1.0, 10.0, 0.1, 0.1], dtype=torch.float64))
-    cost = QuadraticCost(Q=weight, R=0.01 * torch.eye(1, dtype=torch.float64), Q_final=10 * weight)
+    weight = diagonal(1, 10, 0.1, 0.1)
+    cost = QuadraticCost(Q=weight, R=diagonal(0.01), Q_final=10 * weight)
     x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed + STATES)
     return problem(make(cart_pole_between_walls(), cost, horizon, 20.0, x0), seed)
 
@@ -106,11 +113,9 @@ def small(count: int, seeds: int) -> Iterator[tuple[str, Problem]]:
 
 def block(count: int, horizon: int, seed: int) -> Problem:
     """Push the block 5 cm along the wall."""
-    weight = torch.diag(torch.tensor([100.0, 10.0, 0.0, 0.0], dtype=torch.float64))
-    q = torch.tensor([-5.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    eye = torch.eye(2, dtype=torch.float64)
+    weight, q = diagonal(100, 10, 0, 0), torch.tensor([-5.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     missed = torch.tensor(0.5 * 100.0 * 0.05**2 * (horizon + 10), dtype=torch.float64)
-    cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
+    cost = QuadraticCost(Q=weight, R=diagonal(1, 1), Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
     x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed + STATES)
     x0[:, 1] = x0[:, 1].abs()
     x0[:, 2] -= 0.04

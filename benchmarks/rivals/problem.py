@@ -87,6 +87,10 @@ class Problem:
         return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation", "constant")}
 
 
+INPUTS = [f.name for f in fields(Problem) if f.name not in ("horizon", "relaxation", "constant", "weight")]
+"""Fields that are inputs of `difflcs.mpc.MPCProblem`."""
+
+
 @dataclass
 class Answer:
     """Plans for some problems.

@@ -11,8 +11,7 @@ import race_loops
 import race_problems
 import torch
 from models import pushing_model
-from race_global import hard_cost
-from race_problems import cart_pole
+from race_problems import cart_pole, hard_cost
 from rivals import admm, sampling
 from rivals.problem import Condensed, sparse_program
 from scipy.optimize import nnls
