@@ -17,6 +17,7 @@ from difflcs_envs.errors import (
     OptionsError,
     PhysicsWarning,
     RenderingError,
+    extra,
 )
 
 __all__ = [
@@ -47,10 +48,8 @@ def register_envs() -> None:
     Raises:
         MissingDependencyError: Gymnasium is not installed.
     """
-    try:
+    with extra():
         import gymnasium
-    except ImportError as error:
-        raise MissingDependencyError("gymnasium") from error
     for name, (single, vector) in _ENTRY_POINTS.items():
         env_id = f"difflcs/{name}"
         if env_id not in gymnasium.registry:

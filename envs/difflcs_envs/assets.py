@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from difflcs_envs.errors import AssetError, MeshError, MissingDependencyError
+from difflcs_envs.errors import AssetError, MeshError, MissingDependencyError, extra
 from difflcs_envs.locks import one_at_a_time
 from difflcs_envs.ycb import YCB, YcbObject
 
@@ -119,10 +119,8 @@ def _address(url: str, entry: YcbObject) -> str:
 
 
 def _download_object(entry: YcbObject, folder: Path, address: str, report: Callable[[str], object]) -> Path:
-    try:
+    with extra():
         import pooch
-    except ImportError as error:
-        raise MissingDependencyError("pooch") from error
     archive, known = folder / f"{entry.code}_google_16k.tgz", _known_hashes(folder)
     with tempfile.TemporaryDirectory(dir=folder, prefix=WORK) as temporary:
         work, source, wanted = Path(temporary), archive, known.get(archive.name)

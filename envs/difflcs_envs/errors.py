@@ -1,5 +1,8 @@
 """Errors and warnings of the environments. Only `tasks.py` in this package imports `difflcs`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 INSTALL_HINT = 'pip install "difflcs[envs]"'
 
 
@@ -15,6 +18,15 @@ class MissingDependencyError(ImportError, DifflcsEnvsError):
             f"The environments need the package '{package}', which is not installed. Install it with: {INSTALL_HINT}",
             name=package,
         )
+
+
+@contextmanager
+def extra() -> Iterator[None]:
+    """Say of packages that are imported here, but not installed, how to install them."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(error.name or "") from error
 
 
 class RenderingError(RuntimeError, DifflcsEnvsError):

@@ -4,18 +4,14 @@ import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 
 from difflcs_envs.checks import checked_array, checked_options
-from difflcs_envs.errors import MissingDependencyError, PhysicsWarning
+from difflcs_envs.errors import PhysicsWarning
 from difflcs_envs.goal_task import GoalTask
 from difflcs_envs.rendering import SceneRenderer
-
-try:
-    import gymnasium
-    from gymnasium.error import ResetNeeded
-except ImportError as error:
-    raise MissingDependencyError("gymnasium") from error
 
 
 class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):

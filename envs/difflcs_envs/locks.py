@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from difflcs_envs.errors import MissingDependencyError
+from difflcs_envs.errors import extra
 
 
 @contextlib.contextmanager
@@ -15,10 +15,8 @@ def one_at_a_time(path: Path, waiting: Callable[[], object] = lambda: None) -> I
         path: of the lock.
         waiting: called once if another process holds it.
     """
-    try:
+    with extra():
         import filelock
-    except ImportError as error:
-        raise MissingDependencyError("filelock") from error
     lock = filelock.FileLock(path)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

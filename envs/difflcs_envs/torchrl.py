@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from difflcs_envs import register_envs
-from difflcs_envs.errors import MissingDependencyError
+from difflcs_envs.errors import extra
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -33,10 +33,8 @@ def make_env(task: str = "cube", num_envs: int | None = None, **arguments: Any) 
     Raises:
         MissingDependencyError: TorchRL is not installed.
     """
-    try:
+    with extra():
         from torchrl.envs import GymWrapper, RenameTransform, TransformedEnv
-    except ImportError as error:
-        raise MissingDependencyError(error.name or "torchrl") from error
     register_envs()
     env_id, arguments = _resolve(task, arguments)
     arguments = {"observe_time": True, **arguments}

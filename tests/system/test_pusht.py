@@ -1,10 +1,11 @@
-"""Push-T of gym-pusht from outside: the scoreboard, learning from random pushing, the film; shapes of gym-pushany."""
+"""Push-T of gym-pusht, gym-pushany and Fetch from outside: scoreboards, learning from random pushing, the film."""
 
 import importlib.util
 import json
 import math
 from types import SimpleNamespace
 
+import fetch_policies as fetch
 import numpy as np
 import push_t
 import pusht as board
@@ -170,3 +171,26 @@ def test_actions_that_come_late_are_planned_from_where_things_will_be():
     late.act(seen)
     expected = 4.0 + push_t.DRIVE.step().b[0] * (torch.from_numpy(sent) / 100 - 4.0)
     torch.testing.assert_close(late.sampling.decision.states[0, 3:5], expected)
+
+
+# --- Fetch tasks ------------------------------------------------------------------------------------------------------
+
+
+def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it():
+    geoms = SimpleNamespace(friction=np.array([0.1])), SimpleNamespace(friction=np.array([0.05]))
+    model = SimpleNamespace(
+        eq_solref=np.array([[0.02, 1.0]]),
+        body=lambda name: SimpleNamespace(geomadr=[1]),
+        geom=lambda of: geoms[of if of == 1 else 0],
+    )
+    system = fetch.sliding_system(model)
+    x = system.A.new_zeros(5)
+    x[4] = 0.8
+    x[:3] = -1.0  # the gripper is far
+    for k in range(system.horizon):
+        x = system.stage(k).step(x, x.new_zeros(1)).x_next
+    start, velocity = np.zeros(3), np.array([0.8, 0.0, 0.0])
+    assert x[3] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1), abs=2e-3)
+    assert fetch.place_of_rest(start, velocity, 0.1)[0] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1))
+    assert fetch.place_of_rest(start, velocity, 0.1, 0.2)[0] == pytest.approx(0.16 - 0.2**2 * 0.981 / 2)
+    assert abs(x[4]) < 1e-3

@@ -5,10 +5,13 @@ import math
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from difflcs_envs.checks import checked_array, checked_integer, checked_number
-from difflcs_envs.errors import MissingDependencyError
+from difflcs_envs.errors import extra
+from difflcs_envs.goal_env import GoalEnv
 from difflcs_envs.hand.task import (
     ACTION_LIMIT,
     ACTION_SIZE,
@@ -22,15 +25,10 @@ from difflcs_envs.hand.task import (
 from difflcs_envs.rendering import select_gl_backend
 
 select_gl_backend()  # before the first import of MuJoCo
-try:
-    import gymnasium
+with extra():
     import mujoco
-    from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-    from difflcs_envs.goal_env import GoalEnv
     from difflcs_envs.hand.model import GOAL_HEIGHT, OBJECTS, PALM_TOP, POSTURE, SUBSTEPS, TIMESTEP, build_model
-except ImportError as error:
-    raise MissingDependencyError((error.name or "").partition(".")[0]) from error
 
 STEP_SECONDS = SUBSTEPS * TIMESTEP
 PLACE = (-0.02, 0.0)  # [m] of the object on the palm

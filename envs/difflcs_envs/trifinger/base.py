@@ -6,21 +6,17 @@ import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self, TypedDict
 
+import gymnasium
 import numpy as np
 
 from difflcs_envs.checks import checked_array, checked_integer, checked_number
-from difflcs_envs.errors import MissingDependencyError, RenderingError
+from difflcs_envs.errors import RenderingError, extra
+from difflcs_envs.goal_env import GoalEnv
 from difflcs_envs.rendering import SceneViewer, has_display, select_gl_backend
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask, checked_task
 
 select_gl_backend()  # before the first import of MuJoCo
-try:
-    import gymnasium
-
-    from difflcs_envs.goal_env import GoalEnv
-except ImportError as error:
-    raise MissingDependencyError("gymnasium") from error
-try:
+with extra():
     from difflcs_envs.trifinger.model import SceneObject
     from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, TriFingerPhysics
     from difflcs_envs.trifinger.spaces import (
@@ -31,10 +27,6 @@ try:
         make_observation_space,
         unwrap,
     )
-except ImportError as error:
-    if (error.name or "").partition(".")[0] != "mujoco":
-        raise
-    raise MissingDependencyError("mujoco") from error
 
 UNSTABLE = (
     "The simulation became unstable (not finite, or out of the workspace). The episode is truncated at the last finite "

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from difflcs_envs.errors import MeshError, MissingDependencyError
+from difflcs_envs.errors import MeshError, extra
 from difflcs_envs.locks import one_at_a_time
 
 if TYPE_CHECKING:
@@ -99,11 +99,9 @@ def cache_directory() -> Path:
 
 
 def _require_trimesh() -> Any:
-    try:
+    with extra():
         import scipy.spatial  # noqa: F401  (trimesh needs it for convex hulls)
         import trimesh
-    except ImportError as error:
-        raise MissingDependencyError(error.name or "trimesh") from error
     return trimesh
 
 
@@ -331,10 +329,8 @@ def _convex_parts(mesh: trimesh.Trimesh, count: int | None, concavity: float) ->
 
 
 def _decompose(vertices: np.ndarray, faces: np.ndarray, count: int, concavity: float) -> tuple[np.ndarray, ...]:
-    try:
+    with extra():
         import coacd
-    except ImportError as error:
-        raise MissingDependencyError("coacd") from error
     coacd.set_log_level("error")
     hulls = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=concavity, max_convex_hull=count, **COACD_SETTINGS)
     return tuple(np.asarray(points, np.float64) for points, _ in hulls)
