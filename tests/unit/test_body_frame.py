@@ -5,21 +5,14 @@ from typing import Any
 
 import pytest
 import torch
-
-from difflcs.errors import ShapeError
-from difflcs.physics import PlanarPushing, box, find_frame
-from tests.conftest import refuse
-
-pytest.importorskip("torchrl", reason="needs the extra [rl]")
-pytest.importorskip("mujoco", reason="needs the extra [envs]")
-
 from tensordict import TensorDict
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer
-from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.physics import BodyFrameLCS, Frame
+from difflcs.errors import CheckpointError, InvalidInputError, ShapeError
+from difflcs.physics import BodyFrameLCS, Frame, PlanarPushing, box, find_frame
 from difflcs.rl import Epochs, FrameMethod, LCSMPCPolicy, Work, get_task
 from difflcs.rl.learning.jacobian import system_jacobian
+from tests.conftest import refuse
 
 FRAME = Frame(3, (1, 2), ((0, 6), (4, 5)), ((3, 1), (0, 2)))
 """Columns out of order, the last is a plain number."""
