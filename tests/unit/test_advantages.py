@@ -106,9 +106,8 @@ def test_actions_come_in_mirrored_pairs_the_one_taken_first():
 
 
 def test_advantages_are_those_of_the_formula():
-    generator = torch.Generator().manual_seed(0)
-    q = torch.randn(7, 5, 4, generator=generator, dtype=torch.float64)
-    values = torch.randn(7, 5, generator=generator, dtype=torch.float64)
+    n = Build.normal(0)
+    q, values = n(7, 5, 4), n(7, 5)
     found = multi_action_advantages(q, values, 0.9, 0.7)
     residual = q.mean(-1) - values
     corrections = torch.zeros(7, 5, dtype=torch.float64)

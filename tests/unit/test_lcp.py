@@ -12,11 +12,11 @@ from torch.autograd import gradcheck
 
 from difflcs import Status, solve_lcp
 from difflcs.errors import SolveWarning
+from tests.conftest import draw
 
 
 def definite(n, seed, skew=0.5):
-    generator = torch.Generator().manual_seed(seed)
-    G, H = torch.randn(2, n, n, generator=generator, dtype=torch.float64)
+    G, H = draw(2, n, n, seed=seed)
     return G @ G.T + 0.3 * torch.eye(n, dtype=torch.float64) + skew * (H - H.T)
 
 

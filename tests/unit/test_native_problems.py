@@ -24,6 +24,7 @@ from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.records import SYSTEM, dimensions
 from difflcs.systems import cart_pole_between_walls
 from tests.conformance.varied.generators import random_case
+from tests.conftest import Build
 
 BATCHED = BatchedBackend(threads=1)
 every_solver = pytest.mark.parametrize("solver", [BATCHED, IpoptBackend(workers=1)], ids=["batched", "ipopt"])
@@ -64,9 +65,8 @@ def solved(build):
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_native_adjoint_equals_the_reference(solved, name):
-    (problem, result), generator = solved(name), torch.Generator().manual_seed(3)
-    shapes = [v.shape for v in result.primal[:3]] + [(problem.batch,)]
-    grads = tuple(torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    (problem, result), n = solved(name), Build.normal(3)
+    grads = tuple(n(*shape) for shape in [*(v.shape for v in result.primal[:3]), (problem.batch,)])
     ours = BATCHED.vjp(problem, result, grads, result.solved)
     reference = kkt.vjp(problem, kkt.linearise(problem, result.primal), grads, result.solved)
     for name in (name for name in INPUTS if ours[name].numel()):

@@ -17,7 +17,7 @@ from difflcs.physics.mujoco import LearnableMujocoLCS
 from difflcs.rl.learning import jacobian
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import LCSMPCPolicy
-from tests.conftest import F64, refuse
+from tests.conftest import F64, Build, refuse
 from tests.training.slide import STEPS, U_MAX, features
 
 STD = 0.02
@@ -31,10 +31,8 @@ def mpc(build):
 
 
 def observations(*batch: int) -> TensorDict:
-    generator = torch.Generator().manual_seed(0)
-    state = 0.1 * torch.randn(*batch, 2, generator=generator, dtype=torch.float64)
-    goal = 0.1 * torch.randn(*batch, 1, generator=generator, dtype=torch.float64)
-    return TensorDict({"state": state, "goal": goal}, batch)
+    n = Build.normal(0)
+    return TensorDict({"state": 0.1 * n(*batch, 2), "goal": 0.1 * n(*batch, 1)}, batch)
 
 
 def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):

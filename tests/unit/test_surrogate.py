@@ -11,6 +11,7 @@ from difflcs.rl import ViolationLoss
 from difflcs.rl.learning.policy import make_actor
 from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.rollout import transitions
+from tests.conftest import Build, draw
 from tests.training.slide import drawn, make_model, make_mpc
 
 STD = 0.03
@@ -26,8 +27,7 @@ def made(outlier_kl: float = 2.0, beta: float = 1.0, violation: ViolationLoss | 
 def judged(data: TensorDict, seed: int = 0) -> TensorDict:
     """(N, 1) the actions taken, with random advantages."""
     samples = data.select("action", "action_log_prob").unsqueeze(-1)
-    generator = torch.Generator().manual_seed(seed)
-    samples["advantage"] = torch.randn(len(data), 1, 1, generator=generator, dtype=torch.float64)
+    samples["advantage"] = draw(len(data), 1, 1, seed=seed)
     return samples
 
 
@@ -37,10 +37,8 @@ def solved(actor, data: TensorDict) -> TensorDict:
 
 def episodes(count: int = 80) -> TensorDict:
     """Random transitions, more than the violation loss takes in a step."""
-    generator = torch.Generator().manual_seed(1)
-    state = torch.randn(count, 6, 1, generator=generator, dtype=torch.float64)
-    action = torch.randn(count, 5, 1, generator=generator, dtype=torch.float64)
-    return TensorDict({"state": state, "action": action}, [count])
+    n = Build.normal(1)
+    return TensorDict({"state": n(count, 6, 1), "action": n(count, 5, 1)}, [count])
 
 
 def gradients(loss, actor) -> list[torch.Tensor]:
@@ -83,12 +81,11 @@ def test_outliers_are_left_out():
 
 def test_the_gradient_is_that_of_all_actions():
     """At the parameters that drew them the gradient is that of −mean(A log π) over many actions for each state."""
-    actor, surrogate, data = made()
-    generator = torch.Generator().manual_seed(2)
-    action = data["loc"].unsqueeze(1) + STD * torch.randn(len(data), 4, 1, generator=generator, dtype=torch.float64)
+    (actor, surrogate, data), n = made(), Build.normal(2)
+    action = data["loc"].unsqueeze(1) + STD * n(len(data), 4, 1)
     before = MultivariateNormal(data["loc"].unsqueeze(1), scale_tril=data["scale_tril"].unsqueeze(1))
     samples = TensorDict({"action": action, "action_log_prob": before.log_prob(action)}, action.shape[:2])
-    samples["advantage"] = torch.randn(len(data), 4, 1, generator=generator, dtype=torch.float64)
+    samples["advantage"] = n(len(data), 4, 1)
     mean = actor.mpc(data["state"], data["goal"]).action.unsqueeze(1)
     log_prob = -0.5 * ((action - mean) / STD).square().sum(-1)
     expected = gradients(-(samples["advantage"].squeeze(-1) * log_prob).mean(), actor)
