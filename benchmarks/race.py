@@ -413,7 +413,8 @@ def globally(o: Options) -> dict[str, dict]:
             answer = process.ask(problem=path, out=f"{folder}/answer.npz", few=problem.count, seconds=1e9)
             table = families.setdefault(family, {"problems": 0, "proved": 0, "seconds": [], "gaps": {}})
             if "error" in answer:
-                families[family] = answer
+                families[family] = table = answer
+            if "error" in table:  # of this seed, or of one before
                 continue
             mpc, proved = as_mpc(problem), np.array(answer["solved"])
             best = hard_cost(mpc, torch.from_numpy(answer["u"]))[proved].numpy()
