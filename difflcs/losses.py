@@ -63,7 +63,7 @@ def violation_loss(
             default suits states, forces and gaps of like units. A common unit of all of them changes nothing, as the
             loss grows with its square whatever ξ. `suggest_scales` finds such units.
         context: (..., n_context) passed on to the `params` of an `LCSModule`.
-        reduction: "mean" over the batch, or "none" for one value each.
+        reduction: "mean" over the batch, which is 0 of an empty one, or "none" for one value each.
 
     Returns:
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
@@ -126,7 +126,7 @@ def prediction_loss(
         u: (..., n_u) actions.
         x_next: (..., n_x) observed next states.
         context: (..., n_context) passed on to the `params` of an `LCSModule`.
-        reduction: "mean" over the batch, or "none" for one value each.
+        reduction: "mean" over the batch, which is 0 of an empty one, or "none" for one value each.
 
     Returns:
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.

@@ -217,6 +217,6 @@ if __name__ == "__main__":
         if sys.argv[1] == "found":
             print(json.dumps(load_policy(sys.argv[2]).lcs.summary(), indent=1))  # factors of where the guess began
         else:
-            cli.main()
+            sys.exit(cli.main())
     else:
         main(tyro.cli(Options))

@@ -34,6 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from difflcs.cli import doctor
 
             return doctor.main("--json" in words)
+        asked = words[:1] in ([], ["-h"], ["--help"])
+        if asked:
+            print("Without the extra rl: difflcs doctor, which says what works here, and difflcs --version.")
         print(f"difflcs: {error}", file=sys.stderr)
-        return 2
+        return 0 if asked and words else 2
     return commands.run(words)

@@ -220,6 +220,8 @@ class MPCController:
         """
         x = _numbers("x", x, (self.n_x,))
         targets, follow = None, reference is not None
+        if self.n_goal and self._setup is not None and cost is not None:
+            raise ShapeError("cost: expected none where the layer has a GoalCost, got one; give the layer another")
         if self.n_goal:
             if follow == (goal is not None):
                 raise ShapeError(
@@ -260,8 +262,6 @@ class MPCController:
             raise InvalidInputError(
                 f"{', '.join(overrides)}: expected none in a controller of a file, got one; make one from a layer"
             )
-        if self.n_goal and overrides["cost"] is not None:
-            raise ShapeError("cost: expected none where the layer has a GoalCost, got one; give the layer another")
         begun = time.perf_counter()
         goal = (
             np.zeros(self.n_goal) if self.n_goal else None if goal is None else _numbers("goal", goal, np.shape(goal))

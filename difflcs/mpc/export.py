@@ -36,7 +36,7 @@ def export_controller(
     if not isinstance(mpc, LCSMPCLayer):
         raise InvalidInputError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; pass the layer of the controller")
     try:
-        further = json.loads(json.dumps(about or {}, allow_nan=False))
+        further = json.loads(json.dumps(dict(about or {}), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"about: expected finite values in JSON types, got: {error}; convert them") from error
     setup = controller_file.constant_setup(mpc.setup())

@@ -193,6 +193,7 @@ def collect(
     Raises:
         InvalidInputError: too many seeds, an episode of another length, observations that autoreset overwrites, a
             context that changes during an episode, a reward that is not finite, or a success that is no bool.
+        DTypeError: actions of another size than the action space.
     """
     from tensordict import TensorDict  # takes a second
 
@@ -211,6 +212,9 @@ def collect(
     for t in range(episode_steps):
         usable = np.where(stable[:, None], state, 0.0)  # a solver must not see NaN
         action, failed = act(torch.from_numpy(usable), *constant)
+        if action.shape != (n, len(low)):
+            wanted = f"({n}, n_u={len(low)}), as the action space has them"
+            raise DTypeError(f"policy: expected actions {wanted}, got {action.shape}; return all numbers of each")
         action = np.clip(action, low, high)
         batch = np.zeros((env.num_envs, len(low)))
         batch[:n] = action

@@ -337,6 +337,11 @@ class TaskSpec:
                     f"task {self.name}: expected an environment whose observations are a Dict with a {name} of shape "
                     f"({size},), as the cost has {name}s of that size, got {seen}; change one of them"
                 )
+        if (found := shapes.get("context", (0,))) != (self.n_context,):
+            raise InvalidInputError(
+                f"task {self.name}: expected n_context={found[-1]}, the size of the context in the observations of its "
+                f"environment, or 0 without one, got {self.n_context}; change one of them"
+            )
         if getattr(space, "shape", None) != (self.n_u,) or not hasattr(space, "low"):
             raise InvalidInputError(
                 f"task {self.name}: expected an environment whose action space is a Box of shape ({self.n_u},), as the "

@@ -248,9 +248,9 @@ def test_layers_are_exported_too(build, tmp_path):
     assert np.array_equal(u, mpc.controller().step(np.full(4, 0.1)))
     with pytest.raises(InvalidInputError, match="expected an LCSMPCLayer"):
         export_controller(mpc.lcs, tmp_path)
-    for value in (np.zeros(3), np.nan):
+    for about in ({"offset": np.zeros(3)}, {"offset": np.nan}, "mine"):
         with pytest.raises(InvalidInputError, match="about: expected finite values in JSON types"):
-            export_controller(mpc, tmp_path, about={"offset": value})
+            export_controller(mpc, tmp_path, about=about)
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInputError, match="expected a place to write"):
         export_controller(mpc, tmp_path / "file")

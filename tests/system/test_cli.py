@@ -273,6 +273,8 @@ def test_a_missing_package_names_the_line_that_installs_it(capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tyro" else find(name, *a))
     assert 'pip install "difflcs[rl,envs,viz]"' in fails(capsys, "evaluate", "nowhere")
+    code, out, err = run(capsys, "--help")
+    assert (code, "difflcs doctor" in out, "pip install" in err) == (0, True, True)
 
 
 def test_evaluate(capsys, finished):

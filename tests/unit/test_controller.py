@@ -224,8 +224,9 @@ def test_a_step_refuses_what_does_not_fit(build, plain, reaching, tmp_path, own,
     controller.save(tmp_path / "c")
     with pytest.raises(InvalidInputError, match="expected none in a controller of a file"):
         MPCController.load(tmp_path / "c").step(x, **own)
-    with pytest.raises(ShapeError, match="cost: expected none where the layer has a GoalCost"):
-        reaching.controller().step(x, [0.0, 0.0], cost=plain.cost)
+    for goal in ([0.0, 0.0], None):
+        with pytest.raises(ShapeError, match="cost: expected none where the layer has a GoalCost"):
+            reaching.controller().step(x, goal, cost=plain.cost)
 
 
 @pytest.mark.parametrize("change", ["sequence", "size", "F in place", "NaN"])

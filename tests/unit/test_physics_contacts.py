@@ -228,6 +228,7 @@ def test_friction_of_one_on_both_sides_does_not_jam(motion, nearest):
         module = MujocoLCS(model, data, motion=motion, seconds=0.05, caps=caps)
         system = module.params(x := module.observe(data))
         assert module.n_lam == system.n_lam == 6 * 4 + 8 * (caps is None)
+        assert module.params(x.expand(0, 2, -1)).c.shape == (0, 2, module.n_lam)
         u = torch.tensor([0.1], dtype=torch.float64)
         change = system.step(x, u).x_next - x
         moved.append(float(change[model.nv if motion == "dynamic" else 0]))

@@ -141,6 +141,7 @@ def test_a_policy_may_take_states_and_goals_alone_and_return_actions():
         (7, "policy: expected a function of states and goals, got int 7"),
         (lambda x0: x0, "policy: expected a function of states and goals, got function"),
         (lambda x0, goal: goal[:, 0], r"policy: expected it to return plans or actions \(2, n_u\), got \(2,\)"),
+        (lambda x0, goal: goal.expand(-1, 2), r"policy: expected actions \(2, n_u=1\), .* got \(2, 2\); return"),
     ],
 )
 def test_what_is_no_policy_is_refused(policy, message):

@@ -61,6 +61,7 @@ def test_environments_that_cannot_be_made_say_why():
     [
         ({"u_max": 2 * U_MAX}, r"within the action space .* \[-0.2\] to \[0.4\] and \[-0.2\] to \[0.2\]"),
         ({"u_min": -1.0}, "narrow the bounds"),
+        ({"n_context": 1}, "n_context=0, .* got 1; change one"),
         ({"make_cost": lambda: GoalCost.reach(2, 2, goal_weight=(1.0,), input_weight=1.0)}, r"a Box of shape \(2,\)"),
     ],
 )

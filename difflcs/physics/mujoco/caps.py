@@ -83,7 +83,7 @@ class Caps:
 
     def limit_by_forces(self, system: LCSParams, read: Readings, response: Array) -> LCSParams:
         """Set the caps of a system without velocities by its own forces at the nominal action."""
-        if not self.count:
+        if not (self.count and len(read.x)):
             return system
         n, rays = len(read.x), count_forces(len(self._rough), read.dof_contacts.tangent.shape[2])
         x, u = (torch.from_numpy(read.batched(v)) for v in (read.x, read.moved.nominal))
