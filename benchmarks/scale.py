@@ -62,7 +62,8 @@ def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]
     spent = time.process_time() - begun
     solved, iterations = (torch.cat([getattr(p, n) for p in plans]).double() for n in ("converged", "iterations"))
     problem = plans[0].problem
-    starts = backend.starts(problem, guessed=False) if isinstance(backend, BatchedBackend) else 1
+    size = backend.starts(problem, guessed=False) if isinstance(backend, BatchedBackend) else None
+    starts = size.starts // size.groups if size else 1
     row = {
         "family": family,
         "backend": name,

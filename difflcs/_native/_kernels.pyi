@@ -29,6 +29,8 @@ def solve_mpc(
     lam_start: np.ndarray | None,
     mu_start: np.ndarray | None,
     starts: int,
+    groups: int,
+    sure: int,
     seed: int,
     homotopy: float,
     shrink: float,

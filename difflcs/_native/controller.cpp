@@ -117,7 +117,7 @@ Controller::Controller(const void* bytes, size_t size)
     batch.step[kq] = batch.horizon > 1 ? batch.n_x : 0;
     needed = std::max(needed, kernels_.mpc_workspace(batch));
   }
-  search_.reserve(batch, std::max(data_.effort.starts, data_.starts_guessed));
+  search_.reserve(batch, data_.effort);
   workspace_ = Numbers(needed / int64_t(sizeof(double)) + 1);
 }
 
@@ -202,11 +202,11 @@ void Controller::fall_back(double* u) {
 }
 
 void Controller::reserve(int64_t most) {
-  const Kernels& kernels = kernels_for(most * data_.effort.starts);
+  const Kernels& kernels = kernels_for(most * data_.effort.group());
   MpcBatch batch = data_.batch;
   batch.count = most;
   std::unique_ptr<Many> many(new Many{MpcSearch(kernels), {}, {}});
-  many->search.reserve(batch, data_.effort.starts);
+  many->search.reserve(batch, data_.effort);
   many->plans.resize(batch, most);
   many->workspace = Numbers(kernels.mpc_workspace(batch) / int64_t(sizeof(double)) + 1);
   many_ = std::move(many);

@@ -150,6 +150,8 @@ ControllerData read_controller(const void* bytes, size_t size) {
   effort.max_iter = reader.size("max_iter", 1, kLargestCount);
   effort.seed = uint64_t(reader.size("seed", 0, kLargestCount));
   effort.starts = reader.size("starts", 1);
+  effort.groups = reader.size("groups", 1);
+  effort.sure = reader.size("sure", 1);
   data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);
   for (int i = 0; i < kInputs; i++) {

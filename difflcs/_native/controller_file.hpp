@@ -16,7 +16,7 @@
 
 namespace difflcs {
 
-constexpr uint32_t kControllerVersion = 1;
+constexpr uint32_t kControllerVersion = 2;
 
 // Numbers at a boundary of 64 bytes, zero at first.
 class Numbers {

@@ -43,16 +43,17 @@ constexpr double kEqual = 3e-4;
 constexpr double kReach = 3.0, kNone = 100.0;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
-// So many starts or more are searched in groups of at least this many, each with a local search of its own: what one
-// group ends in depends on where it began, and the best of several is better than one that goes on for longer. An
-// element has no further group once so many groups end with its best plan.
-constexpr int64_t kGroup = 16, kLargestGroup = 2 * kGroup - 1, kAgreed = 5;
+// Starts are searched in groups, each with a local search of its own: what one group ends in depends on where it began,
+// and the best of several is better than one that goes on for longer. An element has no further group once so many
+// groups end with its best plan.
+constexpr int64_t kAgreed = 5;
 // The homotopy makes one step per stage, and two if a problem is solved again along one that starts at this
 // multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
-// Starts from the kSoftPulses-th of each kGroup on, which are pulses, follow a homotopy from contact so many powers of ten softer.
-constexpr int64_t kSoftPulses = 8;
+// Starts from the kSoftPulses-th of each kCycle on, which are pulses, follow a homotopy from contact so many powers of
+// ten softer.
+constexpr int64_t kCycle = 16, kSoftPulses = 8;
 constexpr double kSoftened = 1.0, kSoftenedMore = 4.0;
 // The search is at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plan that it
 // finds is then solved at the problem's own, whose kinks keep a plan where it begins.
@@ -131,6 +132,17 @@ void copy_plan(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& 
   to.fragile[j] = from.fragile[i];
 }
 
+// Keeps plan `i` of some as plan `e` of others where that is the first one or a better one: solved if the other is not,
+// or cheaper. Of those not solved the first says why, unless another is a better plan of the same kind.
+void keep_better(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& to, int64_t e) {
+  to.iterations[e] += from.iterations[i];
+  if (from.status[i] == kUnreached) return;
+  const bool done = solved(from.status[i]), before = solved(to.status[e]);
+  const bool better = to.status[e] == kUnreached || done > before;
+  const bool alike = done ? before : from.status[i] == to.status[e];
+  if (better || (alike && from.objective[i] < to.objective[e])) copy_plan(n, from, i, to, e);
+}
+
 // Result of an element that was not begun in time: its first actions, the initial state, no forces.
 void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out, int64_t e) {
   const Sizes n(b);
@@ -203,12 +215,6 @@ int64_t finders(const double* reached, int64_t count, double one) {
   return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * std::abs(one); });
 }
 
-// Whether plan `i` of some is better than plan `j` of others.
-bool better(const MpcPlans& a, int64_t i, const MpcPlans& b, int64_t j) {
-  const bool done = solved(a.status[i]);
-  return done == solved(b.status[j]) ? a.objective[i] < b.objective[j] : done;
-}
-
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
   const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
@@ -248,8 +254,8 @@ MpcPlans MpcSearch::Store::plans() {
           residual.data(), status.data(), fragile.data(), iterations.data()};
 }
 
-void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
-  const int64_t jobs = std::min(starts, kLargestGroup) * batch.count;
+void MpcSearch::reserve(const MpcBatch& batch, const MpcEffort& effort) {
+  const int64_t jobs = effort.group() * batch.count;
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
   reached.reserve(jobs);
@@ -258,8 +264,8 @@ void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   idle.reserve(batch.count);
   patience.reserve(batch.count);
   members.reserve(batch.count);
-  agreed.reserve(batch.count);
-  if (starts >= 2 * kGroup) earlier.resize(batch, batch.count);
+  for (auto* v : {&agreed, &found, &ended}) v->reserve(batch.count);
+  grouped.resize(batch, batch.count);
   origin.reserve(jobs);
 }
 
@@ -298,7 +304,7 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
-  const int64_t chunk = std::max(kChunk, kJobs / std::min(effort.starts, kLargestGroup));
+  const int64_t chunk = std::max(kChunk, kJobs / effort.group());
   MpcBatch searched = batch;
   const bool near = effort.starts == 1 && guess.lam;  // a plan with its forces, of the step before
   searched.relaxation = near ? batch.relaxation : softer(batch);
@@ -321,7 +327,7 @@ void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Sizes n(b);
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
-  if (s.actions == Actions::pulse && start % kGroup >= kSoftPulses)
+  if (s.actions == Actions::pulse && start % kCycle >= kSoftPulses)
     tried.start[job].at_least *= power_of_ten(kSoftened, kSoftenedMore, uniform(effort.seed, start, -1));
   tried.start[job].explore = s.explore;
   double* u = tried.u.data() + job * n.u;
@@ -387,38 +393,41 @@ void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
 void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
                        const MpcPlans& out, Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
-  const int64_t groups = std::max<int64_t>(1, effort.starts / kGroup);
+  const int64_t groups = std::min(effort.groups, effort.starts);
   const MpcPlans to = shifted(batch, out, first);
-  agreed.assign(count, 1);
+  std::fill_n(to.status, count, kUnreached);
+  std::fill_n(to.iterations, count, 0);
+  std::fill_n(to.objective, count, std::numeric_limits<double>::max());
+  for (auto* v : {&agreed, &found, &ended}) v->assign(count, 0);
   members.resize(count);
   std::iota(members.begin(), members.end(), 0);
+  grouped.resize(batch, count);
   for (int64_t g = 0; g < groups && !members.empty() && (g == 0 || !runner.stopped()); g++) {
     const int64_t begin = g * effort.starts / groups;
     MpcEffort part = effort;
     part.starts = (g + 1) * effort.starts / groups - begin;
     part.seed += uint64_t(g) << 32;
-    earlier.resize(batch, g > 0 ? count : 0);
-    for (int64_t e : members) {
-      if (g > 0) copy_plan(n, to, e, earlier.plans(), e);
-      if (g > 0) earlier.iterations[e] = to.iterations[e];
-    }
     search_group(batch, target, guess, part, begin, to, runner, first, count);
     for (int64_t e : members) {
-      if (g == 0) break;
-      const double now = to.objective[e], before = earlier.objective[e];
-      agreed[e] = now < needed(before) ? 1 : agreed[e] + !(before < needed(now));
-      to.iterations[e] += earlier.iterations[e];
-      if (!better(to, e, earlier.plans(), e)) copy_plan(n, earlier.plans(), e, to, e);
+      const double now = grouped.objective[e], before = to.objective[e];
+      if (now < needed(before)) agreed[e] = found[e] = 0;
+      if (!(before < needed(now))) {
+        agreed[e]++;
+        found[e] += ended[e];
+      }
+      keep_better(n, grouped.plans(), e, to, e);
     }
-    const auto done = [&](int64_t e) { return agreed[e] >= kAgreed; };
+    const auto done = [&](int64_t e) { return agreed[e] >= kAgreed || found[e] >= effort.sure; };
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
 }
 
 // Solves the elements `members` from those of the starts that begin with this one, with a guess for the very first.
+// The plans that it finds are `grouped`; those of earlier groups are `earlier`.
 void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
-                             int64_t start, const MpcPlans& out, Runner& runner, int64_t first, int64_t count) {
+                             int64_t start, const MpcPlans& earlier, Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
+  const MpcPlans out = grouped.plans();
   const bool guessed = guess.u && start == 0, whole = guess.lam;  // by actions alone, or by forces too
   const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
   const int64_t shift = guess.u ? 1 : 0;
@@ -449,7 +458,7 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
       } else {
-        const double* u = best[e] >= 0 ? tried.u.data() + best[e] * n.u : start > 0 ? earlier.u.data() + e * n.u : nullptr;
+        const double* u = best[e] >= 0 ? tried.u.data() + best[e] * n.u : start > 0 ? earlier.u + e * n.u : nullptr;
         begin(batch, effort, start + begun + (j - before) / elements - shift, j, u);
       }
       if (begun >= kFixed) tried.start[j].needed = needed(tried.objective[best[e]]);
@@ -509,30 +518,35 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   const int64_t all = tried.count();
   for (int64_t e : members) {
     out.status[e] = kUnreached;
-    out.iterations[e] = 0;
+    out.iterations[e] = ended[e] = 0;
   }
-  const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
-    out.iterations[e] += from.iterations[i];
-    const bool done = solved(from.status[i]);
-    if (from.status[i] == kUnreached || (only_solved && !done)) return;
-    const bool better = out.status[e] == kUnreached || done > solved(out.status[e]);
-    // Of those not solved the first says why, unless another is a better plan of the same kind.
-    const bool alike = done ? solved(out.status[e]) : from.status[i] == out.status[e];
-    if (better || (alike && from.objective[i] < out.objective[e])) copy_plan(n, from, i, out, e);
-  };
   const auto promises = [&](int64_t j) {
     const int64_t b = best[tried.owner[j]];
     return j == b || promising(batch, j, tried.u.data() + b * n.u, tried.objective[b]);
   };
   const auto solve = [&](auto wanted) {
     const int64_t kept = solve_tried(batch, effort, runner, wanted);
-    for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, tried.owner[origin[i]], false);
+    for (int64_t i = 0; i < kept; i++) {
+      keep_better(n, finished.plans(), i, out, tried.owner[origin[i]]);
+      if (solved(finished.status[i]) && !solved(tried.status[origin[i]]))
+        copy_plan(n, finished.plans(), i, tried.plans(), origin[i]);
+    }
   };
   if (!runner.stopped()) solve(promises);
-  // Some were solved before they were compared.
-  for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, tried.owner[j], true);
+  for (int64_t j = 0; j < all; j++) {  // some were solved before they were compared
+    if (!solved(tried.status[j]))
+      out.iterations[tried.owner[j]] += tried.iterations[j];
+    else
+      keep_better(n, tried.plans(), j, out, tried.owner[j]);
+  }
   if (!runner.stopped())
     solve([&](int64_t j) { return !solved(out.status[tried.owner[j]]) && !promises(j); });
+  for (int64_t j = 0; j < all; j++) {
+    const int64_t e = tried.owner[j];
+    const double there = tried.objective[j], least = out.objective[e];
+    if (tried.status[j] == kUnreached || !(there < kHuge) || !solved(out.status[e])) continue;
+    ended[e] += finders(&there, 1, least) || !apart(batch, j, out.u + e * n.u);
+  }
   for (int64_t e : members) {
     // Out of time after its starts were compared: one that was solved by chance need not be the best.
     const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < needed(out.objective[e]);
@@ -550,7 +564,11 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 
 // Whether a job may become better than a plan, and does not approach the same one.
 bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
-  if (!(tried.objective[job] - tried.gained[job] <= objective)) return false;
+  return tried.objective[job] - tried.gained[job] <= objective && apart(batch, job, u);
+}
+
+// Whether the actions of a job lead to another optimum than these.
+bool MpcSearch::apart(const MpcBatch& batch, int64_t job, const double* u) const {
   const Sizes n(batch);
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(batch, tried.element[job], i);
@@ -665,6 +683,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       if (!solved(finished.status[i]) || !(finished.objective[i] < out.objective[e])) continue;
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) {
         idle[e] = -1;
+        ended[e] = 0;  // no start found it
         patience[e] = std::max(kRounds, starts) + more;
       }
       copy_plan(n, finished.plans(), i, out, e);

@@ -12,12 +12,15 @@ namespace difflcs {
 // Effort of the search.
 struct MpcEffort {
   int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
+  int64_t groups;   // in which they are searched one after the other; at least one
+  int64_t sure;     // an element for which so many starts have found its best plan has no further group
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
   int64_t max_iter;
   double certified;  // largest residual of a solved problem
   uint64_t seed;     // of the random starts
+  int64_t group() const { return (starts + groups - 1) / groups; }  // most starts of one
 };
 
 // The guess, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
@@ -63,7 +66,7 @@ class MpcSearch {
   explicit MpcSearch(const Kernels& kernels) : kernels(kernels) {}
 
   // Allocates all memory that a batch of this size can need: afterwards `solve` allocates nothing.
-  void reserve(const MpcBatch& batch, int64_t starts);
+  void reserve(const MpcBatch& batch, const MpcEffort& effort);
 
   // Solves a batch.
   void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out, Runner& runner);
@@ -88,7 +91,7 @@ class MpcSearch {
   void search(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort,
               const MpcPlans& out, Runner& runner, int64_t first, int64_t count);
   void search_group(const MpcBatch& batch, double target, const MpcGuess& guess, const MpcEffort& effort, int64_t start,
-                    const MpcPlans& out, Runner& runner, int64_t first, int64_t count);
+                    const MpcPlans& earlier, Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                bool guessed);
   void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, const double* best);
@@ -98,6 +101,7 @@ class MpcSearch {
   int64_t solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted);
   void harden(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
               int64_t count);
+  bool apart(const MpcBatch& batch, int64_t job, const double* u) const;
   bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
   void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan, int64_t job);
   void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
@@ -105,10 +109,12 @@ class MpcSearch {
   void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
   const Kernels& kernels;
-  Store tried, finished, earlier;  // earlier: the plans of earlier groups
+  Store tried, finished, grouped;  // grouped: the best plans of one group
   std::vector<double> reached;  // objectives of the starts of each element
   std::vector<int64_t> best;    // of the jobs tried for each element
-  std::vector<int64_t> members, agreed;  // the elements of a group; how many groups end with the best plan of each
+  std::vector<int64_t> members;               // the elements of a group
+  std::vector<int64_t> agreed, found;         // how many groups and starts have found the best plan of each
+  std::vector<int64_t> ended;                 // how many starts of one group have found the plan of the group
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };

@@ -21,7 +21,7 @@ from difflcs.records import LCSParams, LCSSequence, system_at
 from difflcs.scales import ScaledLCS
 
 MAGIC = b"\x89LCS\r\n\x1a\n"
-VERSION = 1
+VERSION = 2
 _LARGEST = 2**53  # of whole numbers, so that a double holds it
 _MAPS = ("at", "along")
 
@@ -142,8 +142,8 @@ def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_se
         "shrink": backend.shrink,
         "max_iter": backend.max_iter,
         "seed": backend.seed,
-        "starts": backend.starts(problem, guessed=False),
-        "starts_guessed": backend.starts(problem, guessed=True),
+        **backend.starts(problem, guessed=False)._asdict(),
+        "starts_guessed": backend.starts(problem, guessed=True).starts,
         "step_seconds": step_seconds,
     }
     entries: list[tuple[str, np.ndarray]] = [(name, np.array([value], np.float64)) for name, value in numbers.items()]

@@ -184,6 +184,17 @@ def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
     assert bool((groups.objective <= group.objective * (1 + 1e-9)).all())
 
 
+def test_another_group_of_starts_follows_where_few_of_them_find_the_plan(build):
+    """Where three of four do, that is all."""
+    x0, goal = data(build, 64)
+    one, more = (pushing(build, 5, **options)(x0, goal) for options in ({"restarts": 4}, {}))
+    unsure = more.iterations > one.iterations
+    assert 10 <= int(unsure.sum()) <= 54
+    assert torch.equal(one.u[~unsure], more.u[~unsure])
+    assert bool((more.objective <= one.objective).all())
+    assert bool((more.objective < 0.999 * one.objective).any())
+
+
 def test_a_plan_that_creeps_along_kinks_is_not_lost():
     """These 8 of 192 states have best plans that take over fifty steps at their relaxation."""
     which, known = [167, 129, 132, 89, 11, 191, 160, 58], [5.05, 6.08, 9.94, 6.13, 6.04, 14.54, 10.1, 5.78]
@@ -252,15 +263,15 @@ def test_plans_of_many_contacts_get_more_starts():
     def starts(horizon, n_lam, guessed, n_u=6, **options):
         problem = SimpleNamespace(horizon=horizon, n_lam=n_lam, n_u=n_u)
         efforts = [options] if options else [{"effort": effort} for effort in ("fast", "default", "best")]
-        return [BatchedBackend(**one).starts(problem, guessed) for one in efforts]
+        return [BatchedBackend(**one).starts(problem, guessed)[:2] for one in efforts]
 
-    assert starts(5, 8, guessed=False) == [1, 4, 16]
-    assert starts(5, 8, guessed=True) == [1, 1, 16]
-    assert starts(20, 5, guessed=False) == [3, 16, 128]
-    assert starts(20, 5, guessed=True) == [1, 1, 128]
-    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [3, 16, 128]
-    assert starts(10, 5, guessed=False, n_u=3) == [1, 4, 16]
-    assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [5]
+    assert starts(5, 8, guessed=False) == [(1, 1), (16, 4), (64, 4)]
+    assert starts(5, 8, guessed=True) == [(1, 1), (1, 1), (64, 4)]
+    assert starts(20, 5, guessed=False) == [(3, 1), (32, 2), (128, 8)]
+    assert starts(20, 5, guessed=True) == [(1, 1), (1, 1), (128, 8)]
+    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [(3, 1), (32, 2), (128, 8)]
+    assert starts(10, 5, guessed=False, n_u=3) == [(1, 1), (16, 4), (64, 4)]
+    assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [(5, 1)]
 
 
 def test_what_was_given_up_is_solved_where_all_else_fails():

@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,10 +17,31 @@ from difflcs.mpc.solution import Primal
 from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
-_STARTS: dict[str, tuple[int, int]] = {"fast": (1, 3), "default": (4, 16), "best": (16, 128)}
+
+
+class Starts(NamedTuple):
+    """Starts of an element.
+
+    Attributes:
+        starts: the number of all.
+        groups: in which they are tried one after the other.
+        sure: an element has no further group once so many starts have found its best plan.
+    """
+
+    starts: int
+    groups: int
+    sure: int
+
+
+_STARTS = {
+    "fast": (Starts(1, 1, 1), Starts(3, 1, 1)),
+    "default": (Starts(16, 4, 3), Starts(32, 2, 1)),
+    "best": (Starts(64, 4, 4), Starts(128, 8, 128)),
+}
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
 # numbers: with four starts the worst costs 2.7 times the best on a row of four carts, 45 % more on a cart-pole, H 30.
 _MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON = 100, 20, 40
+_GROUP = 16  # so many starts, or more, make a group where their number is given
 
 
 @dataclass(frozen=True)
@@ -54,18 +75,20 @@ class BatchedBackend(Backend):
     solved to the end; at a harder relaxation the plan that is found is solved once more. Half of the starts, eight for
     each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
-    for long plans. Of four to seven starts only four of these are tried. From 32 starts on, groups of sixteen are
-    searched so one after the other, until five end with the same plan, and the best plan of all counts.
+    for long plans. Of four to seven starts only four of these are tried. Another group of starts is searched so where
+    few have found the best plan; that of all groups counts.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", four; "best", sixteen; 3, 16 and 128 where horizon × n_lam is 100 or
-            more, or 20 times n_u, or the horizon 40, as such plans have many optima. A guess is the first start, and
-            the only one but for "best". Without contact (n_lam = 0) one start is enough.
-        restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search.
+        effort: "fast", one start; "default", up to four groups of four; "best", up to four of sixteen; 3, 2 × 16 and
+            8 × 16 where horizon × n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many
+            optima. A guess is the first start, and the only one but for "best". Without contact (n_lam = 0) one start
+            is enough.
+        restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search,
+            from 32 on in groups of sixteen until five end with the same plan.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
@@ -148,7 +171,7 @@ class BatchedBackend(Backend):
             u_start=None if guess is None else array(guess.u),
             lam_start=None if guess is None else array(guess.lam),
             mu_start=None if guess is None else array(guess.mu),
-            starts=self.starts(problem, guess is not None),
+            **self.starts(problem, guess is not None)._asdict(),
             seed=self.seed,
             homotopy=self.homotopy or 0.0,
             shrink=self.shrink,
@@ -171,12 +194,12 @@ class BatchedBackend(Backend):
             np.minimum(outputs["residual"], _HUGE, out=outputs["residual"])
         return result
 
-    def starts(self, problem: MPCProblem, guessed: bool) -> int:
-        """Return the number of starts of each element; a guess is the first of them."""
+    def starts(self, problem: MPCProblem, guessed: bool) -> Starts:
+        """Return the starts of each element; a guess is the first of them."""
         if self.restarts is not None:
-            return self.restarts
+            return Starts(self.restarts, max(1, self.restarts // _GROUP), self.restarts)
         if guessed and self.effort != "best":
-            return 1  # a guess is taken to be near the optimum that is wanted
+            return Starts(1, 1, 1)  # a guess is taken to be near the optimum that is wanted
         contacts = problem.horizon * problem.n_lam
         many = contacts >= min(_MANY_CONTACTS, _MANY_PER_ACTION * problem.n_u) or problem.horizon >= _LONG_HORIZON
         return _STARTS[self.effort][many]
