@@ -116,6 +116,11 @@ class PDDrive(Drive):
     substeps: int
     order = 2
 
+    @property
+    def seconds(self) -> float:
+        """Of a step of the system."""
+        return self.substep * self.substeps
+
     def step(self) -> DriveStep:
         """See `Drive`."""
         return self._until(_checks.check_positive_int("substeps", self.substeps))
@@ -376,6 +381,8 @@ class PlanarPushing:
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
         step, k = self.drive.step(), self.drive.order
+        if h and not math.isclose(own := getattr(self.drive, "seconds", h), h, rel_tol=1e-6):
+            raise InvalidInputError(f"inertia: expected steps of {own:g} s like the drive, got {h:g}; give both the same")
         for size in (step.A.shape[:-2], step.b.shape[:-1], step.response.shape[:-1]):
             if size not in ((), (2,), (1, 2), (m, 1), (m, 2), (1, 1), (1,)):
                 raise ShapeError(f"drive: expected numbers, (2,), ({m}, 1) or ({m}, 2), got {tuple(size)}; give such")

@@ -120,7 +120,8 @@ def test_a_broken_episode_is_left_out():
     assert len(trainer.buffer) == 1
 
 
-def test_too_few_environments():
-    lcs = LCSModel(2, 1, 1)
-    with pytest.raises(InvalidInputError, match="at least 3 environments, got 2"):
-        Warmup(lcs, Reach(lcs), make_envs(2), small_settings(), 0, STEPS)
+def test_too_few_environments_and_a_policy_with_another_model():
+    lcs, other = LCSModel(2, 1, 1), LCSModel(2, 1, 1)
+    for model, count, match in ((lcs, 2, "at least 3 environments, got 2"), (other, 3, "around the model that is")):
+        with pytest.raises(InvalidInputError, match=match):
+            Warmup(lcs, Reach(model), make_envs(count), small_settings(), 0, STEPS)

@@ -367,7 +367,7 @@ def test_the_physics_follows_a_shape_that_is_learned_as_often_as_gradients_are_t
         torch.testing.assert_close({k: v.detach() for k, v in system.params(x).tensors().items()}, fresh)
 
 
-@pytest.mark.parametrize("drive", [PositionDrive(), PDDrive([100.0, 50.0], 20.0, 0.01, 5), ForceDrive(1.0, 0.1, 0.5)])
+@pytest.mark.parametrize("drive", [PositionDrive(), PDDrive([100.0, 50.0], 20.0, 0.02, 5), ForceDrive(1.0, 0.1, 0.5)])
 @pytest.mark.parametrize("inertia", [None, Inertia(1.0, 0.1)])
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
 def test_states_of_single_precision_and_those_that_are_mapped(drive, inertia):
@@ -539,6 +539,8 @@ def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_g
      ({"drive": PDDrive(torch.ones(3).double(), 2.0, 0.1, 3)}, ShapeError, r"drive: expected .*\(3,\)"),
      ({"drive": ForceDrive([1.0, 2.0], 0.1, [1.0] * 3)}, ShapeError, r"damping: its batch dimensions \(3,\)"),
      ({"inertia": Inertia(tensor([1.0, 2.0]), 0.1)}, ShapeError, "mass: expected a number"),
+     ({"inertia": Inertia(1.0, 0.1), "drive": ForceDrive(1.0, 0.2)}, InvalidInputError, "steps of 0.2 s .* got 0.1"),
+     ({"inertia": Inertia(1.0, 0.1), "drive": PDDrive(1.0, 2.0, 0.1, 2)}, InvalidInputError, "steps of 0.2 s"),
      ({"radius": -0.1}, InvalidInputError, "radius: expected numbers of at least 0"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],
 )  # fmt: skip

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from torch import nn
 
 from difflcs import _storage
-from difflcs._checks import check_positive_int
+from difflcs._checks import check_positive_int, describe
 from difflcs._modules import plain_state, untouched
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
@@ -120,13 +120,20 @@ class EpisodeTrainer(Trainer):
         episodes: most episodes of an iteration.
 
     Raises:
-        InvalidInputError: too few environments.
+        InvalidInputError: too few environments, or a policy that plans with another model.
     """
 
     def __init__(self, learned: Stateful, policy: Policy, seed: int, episode_steps: int, env: VectorEnv, episodes: int):
         super().__init__(learned, policy, seed, episode_steps)
         if env.num_envs < episodes:
             raise InvalidInputError(f"env: expected at least {episodes} environments, got {env.num_envs}")
+        acts: Any = getattr(policy, "lcs", None)
+        parts = acts.modules() if isinstance(acts, nn.Module) else [acts]
+        if acts is not None and all(part is not learned for part in parts):
+            raise InvalidInputError(
+                f"policy: expected an MPC around the model that is learned, got one around {describe(acts)} that is "
+                f"another object; build it with this model"
+            )
         self.env = env
         self.buffer = make_empty_record(env, episode_steps)
         """Episodes to learn from."""
