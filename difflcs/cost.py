@@ -66,19 +66,9 @@ class _Quadratic(TensorFields):
             for name in ("Q_final",) if "S" in fields else ("Q", "R", "Q_final"):
                 check_convex(name, fields[name])
             if "S" in fields:
-                check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
+                check_convex_stages(fields, self.by_stage)
         for name in _DIMENSIONS:
             register(self, name, fields.get(name))
-
-    def _stage_hessian(self, fields: dict[str, Tensor]) -> Tensor:
-        blocks = []
-        for name in "QSR":
-            value = fields[name].detach()
-            staged = not self.by_stage or name in self.by_stage
-            blocks.append(value if staged else value.unsqueeze(-3))
-        batch = _checks.broadcast_batch((name, block.shape[:-2]) for name, block in zip("QSR", blocks, strict=True))
-        Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)
-        return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return name → tensor as it was passed, with the constants; S if there is one."""
@@ -249,6 +239,18 @@ def check_convex(name: str, matrix: Tensor) -> None:
             f"{name}: expected a positive semi-definite matrix, got smallest eigenvalue "
             f"{float(eigenvalues[..., 0].min()):.3e}; a negative weight makes the cost unbounded: learn w.exp() or L Lᵀ"
         )
+
+
+def check_convex_stages(fields: Mapping[str, Tensor], by_stage: Collection[str]) -> None:
+    """Refuse Q, R and S that together have a negative eigenvalue at a stage."""
+    blocks = []
+    for name in "QSR":
+        value = fields[name].detach()
+        blocks.append(value if not by_stage or name in by_stage else value.unsqueeze(-3))
+    batch = _checks.broadcast_batch((name, block.shape[:-2]) for name, block in zip("QSR", blocks, strict=True))
+    Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)
+    whole = torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
+    check_convex("[[Q, S], [Sᵀ, R]]", whole)
 
 
 class GoalCost(TensorFields):

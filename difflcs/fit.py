@@ -14,7 +14,7 @@ from torch import Tensor
 
 from difflcs import _checks
 from difflcs._optional import require
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.errors import InvalidInputError, NonFiniteError, ShapeError
 from difflcs.losses import params_of_transitions
 from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, system_at
 
@@ -71,6 +71,8 @@ class Transitions(NamedTuple):
                     f"episode: expected one number for each row, got {number.size} for {len(s)} states and {len(u)} "
                     f"actions; pass columns of one log"
                 )
+            if bool((number != number).any()):
+                raise NonFiniteError("episode: expected a number for each row, got NaN; leave out rows without one")
             ends = np.flatnonzero(number[1:] != number[:-1]) + 1
             cuts = [0, *ends.tolist(), len(s)]
             pairs = [(s[a:b], u[a : b - 1]) for a, b in itertools.pairwise(cuts)]

@@ -77,11 +77,12 @@ def test_a_weight_with_a_negative_eigenvalue_is_refused(build, name):
         InvalidInputError, match=f"{name}: expected a positive semi-definite.*{re.escape(f'{smallest:.3e}')}"
     ):
         QuadraticCost(**tensors)
-    learned = {**build.cost_tensors(0), name: nn.Parameter(build.cost_tensors(0)[name])}
-    mpc = LCSMPCLayer(build.params(), QuadraticCost(**learned), 3, -1.0, 1.0)
-    with torch.no_grad():
-        learned[name].copy_(tensors[name])  # as an optimiser does
-    refuse(InvalidInputError, f"{name}: expected a positive semi-definite", mpc, torch.zeros(4).double())
+    for kind in (nn.Parameter, torch.Tensor.requires_grad_):
+        learned = {**build.cost_tensors(0), name: kind(build.cost_tensors(0)[name])}
+        mpc = LCSMPCLayer(build.params(), QuadraticCost(**learned), 3, -1.0, 1.0)
+        with torch.no_grad():
+            learned[name].copy_(tensors[name])  # as an optimiser does
+        refuse(InvalidInputError, f"{name}: expected a positive semi-definite", mpc, torch.zeros(4).double())
 
 
 def test_a_goal_cost_has_one_dtype():
@@ -119,6 +120,10 @@ def test_cross_terms_that_make_the_cost_indefinite_are_refused(build, batch):
     with pytest.raises(InvalidInputError, match=r"\[\[Q, S\], \[Sᵀ, R\]\]: expected a positive semi-definite.*-\d"):
         QuadraticCost(**tensors, S=30 * S)
     QuadraticCost(**tensors, S=30 * S, check=False)
+    cost = QuadraticCost(**tensors, S=nn.Parameter(S))
+    cost.S.data.mul_(30)  # as an optimiser does
+    mpc = LCSMPCLayer(build.params(), cost, 3, -1.0, 1.0)
+    refuse(InvalidInputError, r"\[\[Q, S\], \[Sᵀ, R\]\]: expected", mpc, torch.zeros(*batch, 4).double())
 
 
 def test_semidefinite_weights_with_cross_terms_are_accepted():

@@ -84,6 +84,7 @@ def test_a_log_and_its_episodes_are_the_same_transitions():
         (lambda d: Transitions.from_episodes([np.full((3, 2), np.nan)], [np.ones((2, 1))]), NonFiniteError, "states"),
         (lambda d: Transitions.from_episodes([], []), InvalidInputError, "at least one transition"),
         (lambda d: Transitions.from_episodes(np.ones((3, 2)), np.ones((3, 1)), [0, 0]), ShapeError, "one number"),
+        (lambda d: Transitions.from_episodes(np.ones((2, 2)), np.ones((2, 1)), [0, np.nan]), NonFiniteError, "episode"),
         (lambda d: Transitions(*(v[:3] for v in d)).split(), InvalidInputError, "at least two episodes"),
         (lambda d: fit_report(cart_pole_between_walls(), d.x, d.u[1:], d.x_next), ShapeError, "same N"),
         (lambda d: fit_report(cart_pole_between_walls(), d.x, d.u.float(), d.x_next), DTypeError, "u: expected"),
