@@ -431,7 +431,7 @@ class Inputs:
                 value = value.unsqueeze(0)
             if name in SYMMETRIC and not torch.equal(value, value.mT):
                 value = 0.5 * (value + value.mT)
-            if name in _CURVED and (isinstance(tensor, nn.Parameter) or tensor.requires_grad and tensor.is_leaf):
+            if name in _CURVED and (isinstance(tensor, nn.Parameter) or (tensor.requires_grad and tensor.is_leaf)):
                 learned.append(name)  # an optimiser may have changed it
             if name in MAY_BE_INFINITE:
                 if unseen or tensor.requires_grad:

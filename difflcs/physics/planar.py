@@ -382,7 +382,7 @@ class PlanarPushing:
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
         step, k = self.drive.step(), self.drive.order
         if h and not math.isclose(own := getattr(self.drive, "seconds", h), h, rel_tol=1e-6):
-            raise InvalidInputError(f"inertia: expected steps of {own:g} s like the drive, got {h:g}; give both the same")
+            raise InvalidInputError(f"inertia: expected steps of {own:g} s like the drive, got {h:g}; make them equal")
         for size in (step.A.shape[:-2], step.b.shape[:-1], step.response.shape[:-1]):
             if size not in ((), (2,), (1, 2), (m, 1), (m, 2), (1, 1), (1,)):
                 raise ShapeError(f"drive: expected numbers, (2,), ({m}, 1) or ({m}, 2), got {tuple(size)}; give such")
