@@ -295,7 +295,9 @@ class LCSModel(PredictiveModule):
 
         Raises:
             InvalidInputError: the directory cannot be made or written.
+            NonFiniteError: a matrix has NaN or infinity; what is there stays.
         """
+        _checks.check_finite(plain_state(self))
         with _storage.place_to_write(Path(directory), "directory"):
             _storage.save_record(Path(directory), self.kind, self.config(), plain_state(self))
 

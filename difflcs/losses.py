@@ -310,7 +310,11 @@ def largest_gamma(F: Tensor) -> Tensor:
     F = F.detach().double()
     if not F.numel():
         return torch.ones((), dtype=torch.float64, device=F.device)  # nothing limits it
-    return _AUTO * torch.linalg.eigvalsh(F + F.mT)[..., 0].amin()
+    try:
+        return _AUTO * torch.linalg.eigvalsh(F + F.mT)[..., 0].amin()
+    except torch.linalg.LinAlgError:
+        _checks.check_tensor("F", F)  # where a training has diverged
+        raise
 
 
 def check_gamma_range(F: np.ndarray, gamma: float | np.ndarray) -> None:

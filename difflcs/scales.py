@@ -182,11 +182,13 @@ class ScaledLCS(PredictiveModule):
 
         Raises:
             DTypeError: the module within is no `LCSModel`; save its `state_dict` and the scales yourself.
+            NonFiniteError: a matrix has NaN or infinity; what is there stays.
         """
         lcs = _checks.check_kind("lcs", self.lcs, LCSModel, "save its state_dict() and the scales")
         tensors = {f"scales.{name}": getattr(self.scales, name) for name in ("center", "state", "action")}
         tensors |= {f"lcs.{name}": value for name, value in plain_state(lcs).items()}
         numbers = {"xi": self.scales.xi, "relaxation": self.scales.relaxation}
+        _checks.check_finite(tensors)
         with _storage.place_to_write(Path(directory), "directory"):
             _storage.save_record(Path(directory), "ScaledLCS", {"lcs": lcs.config(), **numbers}, tensors)
 

@@ -139,7 +139,8 @@ def test_parameters_that_are_not_finite_are_refused(build, name, function):
     for value in (NAN, INF):
         with torch.no_grad():
             getattr(model, name).reshape(-1)[0] = value
-        refuse(e.NonFiniteError, f"{'F' if name == 'G' else name}: expected finite", call, **tensors)
+        for more in ({}, {"gamma": "auto"}) if function == "violation_loss" else ({},):
+            refuse(e.NonFiniteError, f"{'F' if name == 'G' else name}: expected finite", call, **tensors, **more)
 
 
 def layer(build, **changes):

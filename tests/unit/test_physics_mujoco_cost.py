@@ -153,6 +153,11 @@ def test_weights_and_goals_get_gradients():
     plan = LCSMPCLayer(module, cost, 2, -1.0, 1.0)(x, goal)
     plan.action.square().sum().backward()
     assert float(weight.grad.abs().sum()) > 0
+    for value in (weight, final):
+        with torch.no_grad():
+            value.mul_(-1)  # as an optimiser may
+            refuse(InvalidInputError, "weight: expected at least 0 of weights that are learned", cost.at, x, goal)
+            value.mul_(-1)
 
 
 def test_an_arm_brings_its_hand_to_a_place():

@@ -82,6 +82,10 @@ def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_
     assert (read.scales.xi, read.scales.relaxation) == (scaled.scales.xi, scaled.scales.relaxation)
     refuse(CheckpointError, "ScaledLCS", LCSModel.from_pretrained, tmp_path / "it")
     refuse(DTypeError, "lcs: expected LCSModel", ScaledLCS(scaled, scaled.scales).save_pretrained, tmp_path / "other")
+    scaled.lcs.A.data[0, 0] = torch.nan
+    for diverged in (scaled, scaled.lcs):
+        refuse(NonFiniteError, "A: expected finite numbers, got 1", diverged.save_pretrained, tmp_path / "it")
+    assert torch.equal(ScaledLCS.from_pretrained(tmp_path / "it")(x, u).x_next, read(x, u).x_next)
 
 
 def test_a_state_dict_of_another_system_with_the_same_parameters_is_refused(data):

@@ -192,7 +192,7 @@ class MujocoCost(TensorFields):
         """The cost of plans from states x (..., n_x) to goals (..., n_goal); no context changes it.
 
         Raises:
-            InvalidInputError and its kinds: states or goals of another size.
+            InvalidInputError and its kinds: states or goals of another size, or a weight that was learned below 0.
         """
         given = [*self._held(["weights", *(name for name, _ in self._learned)]).values(), *self._check_goal(goal)]
         given = [value.to("cpu", torch.float64) for value in given]
@@ -203,6 +203,11 @@ class MujocoCost(TensorFields):
         weights = weights + 0  # a copy
         for (_, at), value in zip(self._learned, others, strict=False):
             weights[at] = value
+        if self._learned and bool((weights < 0).any()):
+            raise InvalidInputError(
+                f"weight: expected at least 0 of weights that are learned, got {float(weights.min()):g}; clamp them "
+                f"after each step of the optimiser"
+            )
         weight, effort = weights[:, self._squares], weights[0, self._efforts].sum(0)
         A, offset, turns = self._scene.read(x, self._rows)
         if learns:
