@@ -99,6 +99,13 @@ def test_a_grip_that_the_nominal_control_does_not_close_holds_from_step_to_step(
         assert abs(float(x[10])) < 0.01  # m/s; in half a step it falls at .5
 
 
+def test_no_contact_is_far_stiffer_than_what_it_moves():
+    data = mujoco.MjData(model := load(PINCH, SERVOS))
+    module = MujocoLCS(model, data, motion="dynamic", ctrl=(0.01, 0.01), compliance=1e-6)
+    F = module.params(module.observe(data)).F
+    assert torch.linalg.eigvalsh(F / F.diag().outer(F.diag()).sqrt())[0] > 0.003
+
+
 @pytest.mark.parametrize(
     ("degrees", "heading", "speed"), [(0, 0.0, 0.8), (0, 0.7, 0.8), (30, 0.0, 0.3), (40, 0.0, 0.0)]
 )

@@ -78,7 +78,7 @@ class MujocoLCS:
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
         torsion: False to leave out the torsional friction of contacts with condim 4 or 6, two forces more for each.
         compliance: how far a contact gives way, as a fraction of how far the same force moves the two bodies apart (the
-            median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
+            median over all pairs; in dynamic motion at least 0.01 of its own), > 0. It makes F + Fᵀ ≻ 0.
         cone: model of friction, see `difflcs.physics.complementarity`.
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as

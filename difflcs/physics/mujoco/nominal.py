@@ -28,6 +28,7 @@ from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
+_LEAST = 0.01  # compliance of a contact in parts of how far its own forces move it; MuJoCo's is .05 and more
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
 _GAINS = 1.0  # of the speeds before the step and without contact, which contacts and limits do not make faster
 _ACTS = 0.6, 1.25  # part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
@@ -125,6 +126,18 @@ class Situation(NamedTuple):
     give: float
     compliance: float
     opens: bool
+
+    @property
+    def soft(self) -> Array:
+        """Compliance (n, n_contacts) of each contact of the system, in parts of `give`, with _LEAST of its own.
+
+        A contact that is far stiffer than what it moves, as those of light links are, makes plans creep.
+        """
+        response, (_, normal, tangent) = self.step.seconds * self.step.response, self.contacts[:3]
+        own = give_way(normal, response)
+        if tangent.shape[2]:  # along the rays of its cone
+            own = own + self.contacts.friction**2 * give_way(tangent, response[:, None]).max(-1)
+        return np.maximum(self.compliance, _LEAST * own / self.give)
 
     def rays(self, contacts: MujocoContacts, rows: ScaledRows, response: Array) -> _Rays:
         """Return the rays of contacts and rows as they are found to act, for forces that are nearly exact."""
@@ -308,7 +321,8 @@ def _evaluate(at: Situation, at_once: NDArray[np.bool_]) -> tuple[Nominal, Array
         slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved)
     of_contacts, of_rows = rays.split(forces)
     # What creeps moves the point from which friction counts, which is that of so much compliance.
-    creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (at.compliance * at.give)
+    creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None]
+    creep /= at.soft[:, :, None] * at.give
     velocity = velocity + (step.response @ rays.impulse(forces, settled))[:, :, 0]
     return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried), velocity
 

@@ -88,4 +88,4 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
     compliance = np.clip(2 * contacts.friction**2 / np.maximum(at.give * firm, 1e-99), _LEAST, _MOST)
     rays = count_forces(1, contacts.tangent.shape[2]) if at.opens else 1
     gap = -at.give * compliance * at.step.seconds * force / rays
-    return Overlaps(soft, gap, np.where(soft, compliance, at.compliance))
+    return Overlaps(soft, gap, np.where(soft, compliance, at.soft))
