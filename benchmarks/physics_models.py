@@ -10,6 +10,7 @@ steps with the nominal control, linearised at each by `mjd_transitionFD`, contac
 nominal control near the action, nine tenths of the way, as that of a plan's next pass is.
 
 With `--times` only the CPU time of a state in one batch is told, of each motion and of MuJoCo's own steps, in turn.
+Judo's LEAP hands and arm are there too; in place of their meshes, which its wheel lacks, are hulls of 32 points.
 """
 
 import importlib.util
@@ -88,6 +89,15 @@ def find(packages: tuple[Path, ...]) -> dict[str, tuple[Path, ...]]:
         roots = roots or [Path(place) for place in (spec.submodule_search_locations if spec else None) or ()]
         found[package] = tuple(sorted(path for root in roots for p in patterns for path in root.glob(p)))
     return found
+
+
+def load(path: Path, hulls: bool) -> Any:
+    """Load a model; with `hulls` in place of Judo's meshes."""
+    spec, points = mujoco.MjSpec.from_file(str(path)), np.random.default_rng(0).normal(size=(32, 3))
+    points *= [[0.012, 0.01, 0.016]] / np.linalg.norm(points, axis=1, keepdims=True)  # of a finger tip [m]
+    for mesh in spec.meshes if hulls and path.parents[1].name == "models" else ():
+        mesh.file, mesh.uservert = "", points.ravel().tolist()
+    return spec.compile()
 
 
 def draw(model: Any, data: Any, random: np.random.Generator) -> np.ndarray:
@@ -255,7 +265,7 @@ def main(o: Options) -> None:
                 continue
             name = f"{package}/{path.parent.name}/{path.stem}" if name in results else name
             try:
-                model = mujoco.MjModel.from_xml_path(str(path))
+                model = load(path, o.times)
             except ValueError:
                 continue
             if not model.nv:

@@ -106,6 +106,13 @@ class Actuators:
         self._time = np.maximum(model.actuator_dynprm[self.activated, 0], 1e-15)
         self._muscles = np.flatnonzero(dynamics[self.activated] == _MUSCLE)
         self._rates = model.actuator_dynprm[self.activated, :2].copy()
+        trees, own = _find_trees(model)
+        parts, end = (trees, trees, own[self.activated], own), 2 * model.nv + model.na + model.nu
+        self._trees, self._together = np.concatenate(parts), []
+        for kind in range(3, -1, -1):  # positions last, as what depends on them is kept till then
+            end -= len(part := parts[kind])  # of each tree the first, then the second, ...
+            order = np.array([(part[:i] == tree).sum() for i, tree in enumerate(part)], dtype=np.intp)
+            self._together += [(kind, (np.flatnonzero(order == k) + end).tolist()) for k in np.unique(order)]
 
     def _force_limits(self, model: Any, joint: NDArray[np.intp]) -> Array:
         """Compute the forces (2, nu) that actuators may have, infinite where nothing limits them."""
@@ -229,9 +236,16 @@ class Actuators:
         low, high = self.range
         arrays = {"gain": self.gain, "constant": self.constant, "bias": self.bias, "low": low, "high": high}
         arrays |= {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
-        arrays |= {"activated": self.activated}
+        arrays |= {"activated": self.activated, "tree": self._trees}
         listed = {name: values.tolist() for name, values in arrays.items()}
-        return _mujoco.Motion(fields | listed | {"steps": steps, "advance": advance})
+        return _mujoco.Motion(fields | listed | {"together": self._together, "steps": steps, "advance": advance})
+
+
+def _find_trees(model: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Trees (nv,) of degrees of freedom and (nu,) of actuators; where anything but contacts may join them, one."""
+    joined = model.ntendon or model.neq or model.nplugin or not np.isin(model.actuator_trntype, _JOINTS).all()
+    joint, trees = model.actuator_trnid[:, 0] * (not joined), np.array(model.dof_treeid) * (not joined)
+    return trees, trees[model.jnt_dofadr[joint]]
 
 
 def disabled_actuators(model: Any) -> NDArray[np.bool_]:

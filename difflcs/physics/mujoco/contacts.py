@@ -205,7 +205,7 @@ class ContactFinder:
             "plane": PLANE,
             "tangents": self.n_tangents,
             "axis": [] if self.axis is None else self.axis.tolist(),
-            "radius": model.geom_rbound.copy(),
+            "radius": np.where(kind == PLANE, np.inf, model.geom_rbound),
             "box": model.geom_aabb.reshape(-1, 6).copy(),
             "kind": kind.astype(np.int64),
             "root": model.body_rootid[model.geom_bodyid].astype(np.int64),

@@ -16,7 +16,7 @@ from difflcs.physics.mujoco.native import copy_taken, native
 
 _FUNCTIONS = (
     "mj_kinematics mj_comPos mj_fwdPosition mj_geomDistance mj_solveM mj_forwardSkip mj_RungeKutta "
-    "mj_differentiatePos mjd_transitionFD mj_Euler mj_implicit"
+    "mj_differentiatePos mj_integratePos mj_checkPos mj_checkVel mj_checkAcc mj_Euler mj_implicit"
 ).split()
 _FIELDS = (
     "qpos qvel act ctrl qacc_warmstart geom_xpos geom_xmat cdof subtree_com actuator_length qacc act_dot qfrc_smooth "

@@ -186,7 +186,7 @@ class RowFinder:
         normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
         of_friction = np.arange(len(self._range), len(self._soft.bound))
         chosen = np.concatenate([chosen, np.broadcast_to(of_friction, (n, self.n_friction))], 1)
-        gap, bend = (np.pad(values, ((0, 0), (0, self.n_friction))) for values in (gap, bend))
+        gap, bend = (np.concatenate([values, np.zeros((n, self.n_friction))], 1) for values in (gap, bend))
         return Rows(gap, normal, bend, self._soft.at(chosen), self.n_friction)
 
     def _limits(self, qpos: Array, place: Array, middle: Array | None) -> tuple[Array, Array, Array, Array]:

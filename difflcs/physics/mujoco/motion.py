@@ -5,8 +5,8 @@ way there, with ζ the change of position and ν the velocity:
 
     ν̇ = a + K ζ + D (ν − ν̄) + B (u − ū),    ζ̇ = ν.
 
-K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs, damping,
-gears and servos are all in them. What differs from the simulation takes the time steps of the model's own integrator.
+K, D and B are finite differences like those of `mjd_transitionFD`, of several trees of bodies at once, with gravity,
+Coriolis forces, springs, servos. What differs from the simulation takes the time steps of the model's own integrator.
 Where actuators have activation, ζ stands for its change as well where it acts, and ν̇ for its rate where it changes.
 An actuator at a limit of its control or force has a constant force. Where joints turn far, B is that of the simulation.
 
@@ -468,20 +468,20 @@ class DynamicStep(NamedTuple):
         control = step[:, :, n_x:-1]
         step[:, :, :nv] += control @ motion.moment
         step[:, :, -1] -= np.einsum("nij,nj->ni", control, self.idle)
-        to_x = np.zeros((n, n_x, n_x))
-        to_x[:] = np.eye(n_x)
-        of_x = to_x
+        response, turned = np.zeros((n, n_x, n_x)), self.response
+        place = h * turned
         if tangent is not None:  # ζ = T (r − r̄)
-            of_x = to_x.copy()
-            of_x[:, :nv, :nv], to_x[:, :nv, :nv] = tangent, np.linalg.inv(tangent)
+            inverse = np.linalg.inv(tangent)
+            step[:, :nv] = inverse @ step[:, :nv]
+            step[:, :, :nv] = step[:, :, :nv] @ tangent
+            turned = turned @ inverse.swapaxes(-1, -2)
+            place = h * inverse @ turned
         at = x.copy()
         at[:, nv : 2 * nv] = 0.0
-        A_x = to_x @ step[:, :, :n_x] @ of_x
-        d = at - np.einsum("nij,nj->ni", A_x, at) + np.einsum("nij,nj->ni", to_x, step[:, :, -1])
-        impulse, response = self.response, np.zeros((n, n_x, n_x))
-        both = np.concatenate([h * impulse, impulse], 1)
-        response[:, : 2 * nv, :nv] = to_x[:, : 2 * nv, : 2 * nv] @ both @ to_x[:, :nv, :nv].swapaxes(-1, -2)
-        matrices: Any = A_x, to_x @ control, d, response
+        A_x = np.ascontiguousarray(step[:, :, :n_x])
+        d = at - np.einsum("nij,nj->ni", A_x, at) + step[:, :, -1]
+        response[:, :nv, :nv], response[:, nv : 2 * nv, :nv] = place, turned
+        matrices: Any = A_x, np.ascontiguousarray(control), d, response
         return FreeMotion(*matrices)
 
     def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:

@@ -22,7 +22,7 @@ constexpr double kStill = 1e-9;  // what the normal of a contact moves at most, 
 constexpr int kEnough = 4;       // contacts that hold a face, where there is no room for all
 
 struct Geom {
-  double radius;            // of the sphere around it; 0 for a plane
+  double radius;            // of the sphere around it; infinite for a plane
   int kind, root;           // root: body whose centre its degrees of freedom count from
   Vector centre, half;      // box around it along its axes
   int solid;                // its faces; −1: none
@@ -90,19 +90,19 @@ class Finder {
  private:
   Pose pose(int geom) const { return {place_.geom_xpos, place_.geom_xmat, geom}; }
 
-  // A lower bound of the gap: of spheres around the shapes, then of boxes.
-  double at_least(const Pair& pair, double distance) const {
-    const Geom &a = scene_.geoms[pair.first], &b = scene_.geoms[pair.second];
-    if (a.kind == scene_.plane || b.kind == scene_.plane) {
-      const bool swap = b.kind == scene_.plane;
-      const Pose plane = pose(swap ? pair.second : pair.first), other = pose(swap ? pair.first : pair.second);
-      return separation(plane.axis[2], plane.place, swap ? a : b, other);
-    }
+  // A lower bound of the gap, by spheres around the shapes.
+  double at_least(const Pair& pair) const {
     const Vector apart = load(place_.geom_xpos + 3 * pair.second) - load(place_.geom_xpos + 3 * pair.first);
-    const double spheres = norm(apart) - a.radius - b.radius;
-    if (spheres >= distance) return spheres;
+    return norm(apart) - scene_.geoms[pair.first].radius - scene_.geoms[pair.second].radius;
+  }
+
+  // One by boxes, which takes longer.
+  double at_least_of_boxes(const Pair& pair) const {
+    const Geom &a = scene_.geoms[pair.first], &b = scene_.geoms[pair.second];
     const Pose one = pose(pair.first), two = pose(pair.second);
-    return std::max({spheres, outside(a, one, b, two), outside(b, two, a, one)});
+    if (a.kind == scene_.plane) return separation(one.axis[2], one.place, b, two);
+    if (b.kind == scene_.plane) return separation(two.axis[2], two.place, a, one);
+    return std::max(outside(a, one, b, two), outside(b, two, a, one));
   }
 
   // How far a box is beyond a plane.
@@ -135,8 +135,8 @@ class Finder {
     *near = 0;
     if (group.count == 0) return;
     for (int p = group.begin; p < group.end; p++) {
-      const double lower = at_least(scene_.pairs[p], group.distance);
-      if (lower < group.distance) candidates_.push_back({-lower, p});
+      const double lower = at_least(scene_.pairs[p]);
+      if (lower < group.distance) candidates_.push_back({-lower, ~p});
     }
     std::make_heap(candidates_.begin(), candidates_.end());
     while (!candidates_.empty()) {
@@ -145,7 +145,14 @@ class Finder {
       if (enough && -lower > std::max(nearest_.front(), within)) break;
       std::pop_heap(candidates_.begin(), candidates_.end());
       candidates_.pop_back();
-      add(pair, group);
+      if (pair >= 0) {
+        add(pair, group);
+        continue;
+      }
+      const double more = std::max(-lower, at_least_of_boxes(scene_.pairs[~pair]));
+      if (!(more < group.distance)) continue;
+      candidates_.push_back({-more, ~pair});
+      std::push_heap(candidates_.begin(), candidates_.end());
     }
     const bool room = static_cast<int>(found_.size()) <= group.count;
     for (const Contact& c : found_) {
@@ -367,7 +374,7 @@ class Finder {
   const Library& library_;
   const Scene& scene_;
   const Place& place_;
-  std::vector<std::pair<double, int>> candidates_;  // minus the least gap, pair: a heap
+  std::vector<std::pair<double, int>> candidates_;  // minus the least gap, pair or, by spheres alone, ~pair: a heap
   std::vector<double> nearest_;                     // gaps of the nearest contacts so far: a heap
   std::vector<Contact> of_pair_, found_, chosen_;
   std::array<double, kMostPoints * kContactDoubles> contacts_;

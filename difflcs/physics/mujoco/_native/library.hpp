@@ -21,18 +21,17 @@ using Solve = void (*)(const void* model, void* data, double* x, const double* y
 using Forward = void (*)(const void* model, void* data, int stage, int without_sensors);
 using RungeKutta = void (*)(const void* model, void* data, int order);
 using Difference = void (*)(const void* model, double* velocity, double seconds, const double* from, const double* to);
-using Transition = void (*)(const void* model, void* data, double step, unsigned char centered, double* A, double* B,
-                            double* C, double* D);
+using Integrate = void (*)(const void* model, double* qpos, const double* velocity, double seconds);
 using OnError = void (*)(const char*);
 
 struct Library {
-  Act kinematics, com_pos, fwd_position;
+  Act kinematics, com_pos, fwd_position, check_pos, check_vel, check_acc;
   Distance distance;
   Solve solve_mass;
   Forward forward;
   RungeKutta runge_kutta;
   Difference difference;
-  Transition transition;
+  Integrate integrate;
   const Collide* collide;  // table of kinds of geoms
   int kinds;
   int stride;  // doubles of a contact; the first ten: gap, place in the middle, normal, tangent

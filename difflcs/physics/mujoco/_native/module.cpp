@@ -41,12 +41,15 @@ Library make_library(const nb::dict& f, int kinds, int stride) {
   library.kinematics = at<Act>(f, "mj_kinematics");
   library.com_pos = at<Act>(f, "mj_comPos");
   library.fwd_position = at<Act>(f, "mj_fwdPosition");
+  library.check_pos = at<Act>(f, "mj_checkPos");
+  library.check_vel = at<Act>(f, "mj_checkVel");
+  library.check_acc = at<Act>(f, "mj_checkAcc");
   library.distance = at<Distance>(f, "mj_geomDistance");
   library.solve_mass = at<Solve>(f, "mj_solveM");
   library.forward = at<Forward>(f, "mj_forwardSkip");
   library.runge_kutta = at<RungeKutta>(f, "mj_RungeKutta");
   library.difference = at<Difference>(f, "mj_differentiatePos");
-  library.transition = at<Transition>(f, "mjd_transitionFD");
+  library.integrate = at<Integrate>(f, "mj_integratePos");
   library.collide = at<const Collide*>(f, "mjCOLLISIONFUNC");
   library.kinds = kinds;
   library.stride = stride;
@@ -141,6 +144,8 @@ Motion make_motion(const nb::dict& f) {
     into->assign(mask.begin(), mask.end());
   }
   m.activated = value<std::vector<int>>(f, "activated");
+  m.tree = value<std::vector<int>>(f, "tree");
+  m.together = value<std::vector<std::tuple<int, std::vector<int>>>>(f, "together");
   m.identity.assign(static_cast<size_t>(m.nv) * m.nv, 0.0);
   for (int v = 0; v < m.nv; v++) m.identity[v * m.nv + v] = 1.0;
   return m;
@@ -215,11 +220,14 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
         acceleration.size() == n * (nv + na) && A.size() == n * size * size && B.size() == n * size * nu &&
         inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
         !places.empty());
+  const size_t each = motion.nq + 2 * nv + na + nu;
+  std::vector<double> memory(places.size() * each);
   return at_places(library, places, n, [&](size_t p, int64_t i) {
     const Linearised into{middle.data() + i * size, acceleration.data() + i * (nv + na), A.data() + i * size * size,
                           B.data() + i * size * nu, inverse_mass.data() + i * nv * nv,   nominal.data() + i * nu,
                           reached.data() + i * size};
-    Reader(library, motion, *places[p]).read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into);
+    Reader(library, motion, *places[p])
+        .read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into, &memory[p * each]);
   });
 }
 

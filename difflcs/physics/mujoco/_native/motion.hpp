@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <tuple>
 #include <vector>
 
 #include "library.hpp"
@@ -12,7 +13,7 @@ namespace difflcs::physics {
 
 constexpr double kBeyond = 1e9;  // acceleration of a simulation that diverges and says nothing
 constexpr double kDifference = 1e-6;
-constexpr int kPositions = 1;  // the stage of MuJoCo that computes them, as one to skip
+constexpr int kPositions = 1, kVelocities = 2;  // stages of MuJoCo that compute what depends on them, to skip
 
 // What all states have in common.
 struct Motion {
@@ -25,6 +26,8 @@ struct Motion {
   std::vector<char> holds, relative;         // (nu)
   std::vector<int> activated;                // (na) the actuator of each activation
   std::vector<double> identity;              // (nv, nv)
+  std::vector<int> tree;                     // (n_x + nu) group of trees that each number of states and controls moves
+  std::vector<std::tuple<int, std::vector<int>>> together;  // kinds, and numbers that change at once, of different trees
 
   int size() const { return 2 * nv + na; }
 };
@@ -40,7 +43,8 @@ class Reader {
   Reader(const Library& library, const Motion& motion, const Place& place)
       : library_(library), motion_(motion), place_(place) {}
 
-  void read(const double* state, const double* ctrl, const Linearised& into) const {
+  // There is memory for a state, controls and a direction (nv).
+  void read(const double* state, const double* ctrl, const Linearised& into, double* memory) const {
     const Motion& m = motion_;
     read_mass(state, into.inverse_mass);
     hold(ctrl);
@@ -55,7 +59,8 @@ class Reader {
     change(state, into.middle);
     std::copy_n(place_.qacc, m.nv, into.acceleration);
     std::copy_n(place_.act_dot, m.na, into.acceleration + m.nv);
-    library_.transition(m.linearised, place_.data, kDifference, 0, into.A, into.B, nullptr, nullptr);
+    for (const Act check : {library_.check_pos, library_.check_vel, library_.check_acc}) check(m.linearised, place_.data);
+    differentiate(into, memory);
     simulate(m.steps - m.steps / 2);
     change(state, into.reached);
   }
@@ -110,6 +115,39 @@ class Reader {
       } else {
         library_.runge_kutta(motion_.simulated, place_.data, 4);
       }
+    }
+  }
+
+  // Write what `mjd_transitionFD` says of velocities and activation after a step of one second: rates there are now.
+  void differentiate(const Linearised& into, double* now) const {
+    const Motion& m = motion_;
+    const int nx = m.size(), begins[] = {0, m.nv, 2 * m.nv, nx}, stages[] = {0, kPositions, kVelocities, kVelocities};
+    double *ctrl = now + m.nq + m.nv + m.na, *way = ctrl + m.nu;
+    std::copy_n(place_.qpos, m.nq, now);
+    std::copy_n(place_.qvel, m.nv, now + m.nq);
+    std::copy_n(place_.act, m.na, now + m.nq + m.nv);
+    std::copy_n(place_.ctrl, m.nu, ctrl);
+    const auto side = [&](int j) {  // 1 where a number may be more by the difference; −1: less; or neither
+      if (j < nx) return 1;
+      const double u = ctrl[j - nx], low = m.low[j - nx], high = m.high[j - nx];
+      return u >= low && u + kDifference <= high ? 1 : -(u - kDifference >= low && u <= high);
+    };
+    for (const auto& [kind, columns] : m.together) {
+      double* const changed[] = {way, place_.qvel, place_.act, place_.ctrl};
+      std::fill_n(way, m.nv, 0.0);
+      for (const int j : columns) changed[kind][j - begins[kind]] += kind == 0 ? 1.0 : side(j) * kDifference;
+      if (kind == 0) library_.integrate(m.linearised, place_.qpos, way, kDifference);
+      library_.forward(m.linearised, place_.data, stages[kind], 1);
+      for (const int j : columns) {
+        for (int i = m.nv; i < nx; i++) {
+          if (m.tree[i] != m.tree[j] || side(j) == 0) continue;
+          const double rate = i < 2 * m.nv ? place_.qacc[i - m.nv] : place_.act_dot[i - 2 * m.nv];
+          const double change = (i == j) + (rate - into.acceleration[i - m.nv]) / (side(j) * kDifference);
+          (j < nx ? into.A[i * nx + j] : into.B[i * m.nu + j - nx]) = change;
+        }
+      }
+      set(now);
+      std::copy_n(ctrl, m.nu, place_.ctrl);
     }
   }
 
