@@ -5,7 +5,7 @@ folder `envs` DIR has to be. An object lies within 5 cm of the middle at a yaw u
 likewise. A decision moves the targets of nine joints by at most 0.01 rad from where they are; torques follow them for
 20 steps of 2 ms. Success: within 2 cm and 1 − (q·goal)² < 0.04 (23°) after each of 21 decisions in a row, of 500.
 
-The controller knows model and state. It is that of the Allegro hand (`benchmarks/scoreboard/inhand.py`) in small: a
+The controller knows model and state. It is that of the Allegro hand (`allegro_turn.py`) in small: a
 quasi-dynamic `MujocoLCS` and a `MujocoCost`, linearised where robot and object are; a planned step is tried in MuJoCo,
 and where the object comes no nearer the fingers let go, go round it or over it, and take it anew.
 """
