@@ -153,13 +153,6 @@ class _Record(SystemMatrices):
         vars(record).update(vars(like) if like is not None else {"_checked": _numbers_of(tensors["F"])}, **tensors)
         return record
 
-    @classmethod
-    def of_fitting(cls, tensors: Mapping[str, Tensor]) -> Self:
-        """Make a record of all its tensors, whose shapes and dtypes fit each other; only the numbers are checked."""
-        check_finite(tensors)
-        check_positive_definite(tensors["F"])
-        return cls.of_checked(tensors)
-
     def _rank(self, name: str) -> int:
         """Count a field's dimensions after those of the batch: stages, rows and columns."""
         return len(self._STAGES) + len(SYSTEM[name])

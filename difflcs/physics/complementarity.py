@@ -127,7 +127,7 @@ class Bounded(NamedTuple):
     effect: Tensor | None = None
 
 
-_DRAG = 1e-3  # part of a way that the drag of a bounded force gives back
+DRAG = 1e-3  # part of a way that the drag of a bounded force gives back
 
 
 def given_states(x: Tensor | None) -> Tensor:
@@ -225,24 +225,22 @@ def contact_lcs(
 def assemble_lcs(
     contacts: Contacts,
     free: FreeMotion,
-    x: Any,
-    mu: Any,
-    soft: Any,
+    x: Tensor,
+    mu: Tensor,
+    soft: Tensor,
     cone: Cone,
     length: float,
     force: float,
-    rest: Any = None,
+    rest: Tensor | None = None,
     unilateral: Unilateral | None = None,
     bounded: Bounded | None = None,
-    caps: Any = None,
+    caps: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Compute the matrices of `contact_lcs` by name, of its arguments; nothing is checked.
 
-    The numbers are all tensors, or all NumPy arrays, which take a third of the time at a single state. There is
-    friction `mu` (..., n_contacts), and `soft` (..., n), the compliance of each contact, one-sided constraint and
-    bounded force in units of length / force.
+    There is friction `mu` (..., n_contacts), and `soft` (..., n), the compliance of each contact, one-sided constraint
+    and bounded force in units of length / force.
     """
-    of: Any = torch if isinstance(x, Tensor) else np
     n_contacts, n_tangents = contacts.gap.shape[-1], contacts.tangent.shape[-2]
     n_caps = 0 if caps is None else caps.shape[-1]
     smooth = Unilateral(contacts.gap[..., :n_caps], contacts.normal[..., :n_caps, :])
@@ -251,38 +249,31 @@ def assemble_lcs(
     directions = _normals_and_tangents if stewart_trinkle else _rays
     rows, normals, gap = directions(contacts, mu) if n_tangents else (contacts.normal, contacts.normal, contacts.gap)
     each = rows.shape[-2] // max(n_contacts, 1)
-    softness = _repeat(soft[..., :n_contacts], each, -1)
-    C = (free.response @ rows.swapaxes(-1, -2)) * force
+    softness = soft[..., :n_contacts].repeat_interleave(each, -1)
+    C = (free.response @ rows.mT) * force
     if more:
-        effects = [free.response @ m[1].swapaxes(-1, -2) if m.effect is None else m.effect for m in more]
-        counted = [m[1] if isinstance(m, Unilateral) else of.zeros_like(m[1]) for m in more]
+        effects = [free.response @ m[1].mT if m.effect is None else m.effect for m in more]
+        counted = [m[1] if isinstance(m, Unilateral) else torch.zeros_like(m[1]) for m in more]
         rows, normals = _join(-2, rows, *(m[1] for m in more)), _join(-2, normals, *counted)
         gap, softs = _join(-1, gap, *(m[0] for m in more)), (softness, soft[..., :n_caps], soft[..., n_contacts:])
-        softness = of.concatenate(softs, -1)
+        softness = torch.cat(softs, -1)
         C = _join(-1, C, *(effect * force for effect in effects))
     rows, normals = rows / length, normals / length
     F = rows @ C
-    n_lam = F.shape[-1]
-    F, forces = 0.5 * (F + F.swapaxes(-1, -2)), np.arange(n_lam)
-    if of is torch:
-        F = F + torch.diag_embed(softness)
-    else:
-        F[..., forces, forces] += softness
+    F, forces = 0.5 * (F + F.mT) + torch.diag_embed(softness), np.arange(F.shape[-1])
     D = rows @ free.A - (rows - normals)
-    c = gap / length + _apply(rows, free.d) - _apply(normals, x)
+    c = gap / length + matvec(rows, free.d) - matvec(normals, x)
     if stewart_trinkle:
         forces += np.minimum(forces // each, n_contacts)
     c = c if rest is None else c - softness * rest[..., forces] / force
-    found = free.A, free.B, C, free.d, D, rows @ free.B, F, c
-    A, B, *changed = found if of is torch else map(torch.from_numpy, found)
-    system = _Rows(*changed)
+    system = _Rows(C, free.d, D, rows @ free.B, F, c)
     if stewart_trinkle:
-        system = _limit_friction(system, torch.as_tensor(mu), each, torch.from_numpy(forces).to(system.F.device))
+        system = _limit_friction(system, mu, each, torch.from_numpy(forces).to(F.device))
     if n_caps or (bounded is not None and bounded.offset.shape[-1]):
         none = system.c[..., :0]
-        low, high = (none, none) if bounded is None else (torch.as_tensor(v / force) for v in bounded[2:4])
-        system = _bound(system, low, high, none if caps is None else torch.as_tensor(caps / force), each)
-    return {"A": A, "B": B, **system._asdict()}
+        low, high = (none, none) if bounded is None else (v / force for v in bounded[2:4])
+        system = _bound(system, low, high, none if caps is None else caps / force, each)
+    return {"A": free.A, "B": free.B, **system._asdict()}
 
 
 class _Rows(NamedTuple):
@@ -312,28 +303,17 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor, caps: Tensor, each: int)
     larger = F.new_zeros(*F.shape[:-2], n_lam + n + n_caps, n_lam + n + n_caps)
     larger[..., :n_lam, :n_lam] = F
     larger[..., forces, groups], larger[..., groups, forces] = 1.0, -1.0
-    larger[..., added, added] = _DRAG / F.diagonal(dim1=-2, dim2=-1)[..., first]
+    larger[..., added, added] = DRAG / F.diagonal(dim1=-2, dim2=-1)[..., first]
     columns, rows = (0, n + n_caps), (0, 0, 0, n + n_caps)
     C, D, E = (torch.nn.functional.pad(v, by) for v, by in ((C, columns), (D, rows), (E, rows)))
     return _Rows(C, d, D, E, larger, _join(-1, c, most))
 
 
-def _join(dim: int, *parts: Any) -> Any:
-    """Concatenate along a dimension arrays whose dimensions before it broadcast."""
-    of: Any = torch if isinstance(parts[0], Tensor) else np
+def _join(dim: int, *parts: Tensor) -> Tensor:
+    """Concatenate along a dimension tensors whose dimensions before it broadcast."""
     batch = broadcast_batch([("part", part.shape[:dim]) for part in parts])
-    alike = (p if tuple(p.shape[:dim]) == tuple(batch) else of.broadcast_to(p, (*batch, *p.shape[dim:])) for p in parts)
-    return of.concatenate(tuple(alike), dim)
-
-
-def _apply(matrix: Any, vector: Any) -> Any:
-    """Multiply a matrix with a vector."""
-    return matvec(matrix, vector) if isinstance(matrix, Tensor) else (matrix @ vector[..., None])[..., 0]
-
-
-def _repeat(values: Any, times: int, dim: int) -> Any:
-    """Repeat each of some values along a dimension."""
-    return values.repeat_interleave(times, dim) if isinstance(values, Tensor) else values.repeat(times, dim)
+    alike = (p if p.shape[:dim] == batch else p.expand(*batch, *p.shape[dim:]) for p in parts)
+    return torch.cat(tuple(alike), dim)
 
 
 _SHAPES: dict[Any, str] = {
@@ -386,24 +366,23 @@ def _per_row(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Ten
     return value if value.ndim and value.shape[-1] == gap.shape[-1] else value.expand(*value.shape[:-1], gap.shape[-1])
 
 
-def _rays(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
+def _rays(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the extreme rays n ± μ t of each contact, what of them counts from x̄, and their gaps."""
-    of: Any = torch if isinstance(mu, Tensor) else np
     n, n_tangents, n_x = contacts.tangent.shape[-3:]
     normal, slide = contacts.normal[..., None, :], mu[..., None, None] * contacts.tangent
-    rays = of.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
-    normals, gap = _repeat(contacts.normal, 2 * n_tangents, -2), _repeat(contacts.gap, 2 * n_tangents, -1)
+    rays = torch.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
+    normals = contacts.normal.repeat_interleave(2 * n_tangents, -2)
+    gap = contacts.gap.repeat_interleave(2 * n_tangents, -1)
     return rays.reshape(*rays.shape[:-4], 2 * n * n_tangents, n_x), normals, gap
 
 
-def _normals_and_tangents(contacts: Contacts, mu: Any) -> tuple[Any, Any, Any]:
+def _normals_and_tangents(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the same of the directions n, t and −t of each contact, with a gap along n alone."""
-    of: Any = torch if isinstance(mu, Tensor) else np
     normal, (*batch, n, k, n_x) = contacts.normal[..., None, :], contacts.tangent.shape
-    both = of.stack([contacts.tangent, -contacts.tangent], -2).reshape(*batch, n, 2 * k, n_x)
-    still = of.zeros_like(both)
-    gap = of.concatenate([contacts.gap[..., None], still[..., 0]], -1)
-    rows, normals = (of.concatenate([normal, v], -2).reshape(*batch, n * (1 + 2 * k), n_x) for v in (both, still))
+    both = torch.stack([contacts.tangent, -contacts.tangent], -2).reshape(*batch, n, 2 * k, n_x)
+    still = torch.zeros_like(both)
+    gap = torch.cat([contacts.gap[..., None], still[..., 0]], -1)
+    rows, normals = (torch.cat([normal, v], -2).reshape(*batch, n * (1 + 2 * k), n_x) for v in (both, still))
     return rows, normals, gap.reshape(*batch, n * (1 + 2 * k))
 
 

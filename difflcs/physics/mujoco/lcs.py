@@ -15,7 +15,7 @@ from torch import Tensor
 
 from difflcs._checks import check_array, check_choice, check_kind, check_number, check_tensor, takes_arrays
 from difflcs.errors import InvalidInputError
-from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, assemble_lcs, count_forces, given_states
+from difflcs.physics.complementarity import Cone, Contacts, count_forces, given_states
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
@@ -236,7 +236,7 @@ class MujocoLCS:
             overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
             nominal = overlaps.evaluate(at)
             contacts, rows = nominal.contacts, nominal.rows
-            rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone, self._caps.count))
+            rest = nominal.rest(rough, self._finder.n_tangents, self.cone, self._caps.count)
             loads, response = nominal.forces[:, rough].sum(-1), step.response
             free = step.free(read.tangent, nominal.carried)
         else:
@@ -245,31 +245,19 @@ class MujocoLCS:
             response = np.broadcast_to(read.to_dofs(free.response), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
-        caps = read.batched(self._caps.limit(contacts, loads, response, unit))
+        caps = self._caps.limit(contacts, loads, response, unit)
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
             contacts = contacts.take(np.s_[:, rough])
         soft = np.full_like(contacts.gap, self.compliance) if overlaps is None else overlaps.compliance[:, rough]
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
-        matrices = assemble_lcs(
-            read.contacts(contacts),
-            FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in zip(free, (2, 2, 1, 2), strict=True))),
-            read.batched(read.x),
-            read.batched(contacts.friction),
-            read.batched(soften(rows, found, step, self._give, self.compliance, soft)),
-            self.cone,
-            self.length,
-            unit,
-            rest,
-            **read.constraints(rows, effect),
-            caps=caps,
-        )
-        system = LCSParams.of_fitting(matrices)
+        soft = soften(rows, found, step, self._give, self.compliance, soft)
+        system = read.assemble(contacts, rows, free, effect, caps, soft, self.cone, self.length, unit, rest)
         system = self._caps.limit_by_forces(system, read, response) if step is None else system
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = read.tangent, rows.bound / unit, found, hard, rest != 0
+            more = read.tangent, rows.bound / unit, found, hard, read.batched(rest != 0)
             system, read.doubtful[:] = correct(system, step, read.after, *more)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -294,7 +282,7 @@ class MujocoLCS:
     def contacts(self, x: Tensor) -> Contacts:
         """Compute gaps and their derivatives at states x (..., n_x); a missing contact has `distance` and zeros."""
         read = self._read(x)
-        return Contacts(*map(torch.from_numpy, read.contacts(read.dof_contacts)))
+        return Contacts(*map(read.batched, read.contacts(read.dof_contacts)))
 
     @takes_arrays
     def control(self, x: Tensor, u: Tensor) -> Tensor:

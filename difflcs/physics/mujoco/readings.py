@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from difflcs.physics.complementarity import Bounded, Contacts, Unilateral
+from difflcs._checks import check_finite, check_positive_definite
+from difflcs.physics import complementarity
+from difflcs.physics.complementarity import Bounded, Contacts, FreeMotion, Unilateral
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import ScaledRows
+from difflcs.records import SYSTEM, LCSParams
 
 
 class Readings(NamedTuple):
@@ -42,22 +46,46 @@ class Readings(NamedTuple):
         return value.reshape(*self.batch, *value.shape[1:])
 
     def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
-        """Convert derivatives by the degrees of freedom to derivatives by the state."""
-        return Contacts(
-            self.batched(dof_contacts.gap), self._of_state(dof_contacts.normal), self._of_state(dof_contacts.tangent)
-        )
+        """Convert derivatives by the degrees of freedom to derivatives by the state; all are tensors."""
+        rows = self._of_state(dof_contacts.normal), self._of_state(dof_contacts.tangent)
+        return Contacts(*_tensors(dof_contacts.gap, *rows))
 
-    def constraints(self, rows: ScaledRows, effect: Any) -> dict[str, Any]:
-        """Return rows that are no contacts as arguments of `contact_lcs`; `effect` (n, n_x, k) as there."""
-        k = rows.gap.shape[1] - rows.bound.shape[1]
-        gap, along = self.batched(rows.gap), self._of_state(rows.normal)
-        effects = [None, None] if effect is None else [self.batched(effect[:, :, :k]), self.batched(effect[:, :, k:])]
-        bound, found = self.batched(rows.bound), {}
-        if k:
-            found["unilateral"] = Unilateral(gap[..., :k], along[..., :k, :], effects[0])
-        if rows.bound.shape[1]:
-            found["bounded"] = Bounded(gap[..., k:], along[..., k:, :], -bound, bound, effects[1])
-        return found
+    def assemble(
+        self, contacts: MujocoContacts, rows: ScaledRows, free: FreeMotion, effect: Any, caps: Any, *more: Any
+    ) -> LCSParams:
+        """Make the systems of `contact_lcs`, of arrays of n states that are by the degrees of freedom.
+
+        All contacts have friction, up to their caps (n, n_caps). The rows are other constraints, the last of which are
+        bounded, with an effect (n, n_x, k), see `Unilateral`. After that are arguments as of `assemble_lcs`.
+        """
+        k, none, (soft, cone, length, force, rest) = rows.gap.shape[1] - rows.bound.shape[1], np.zeros(0), more
+        if cone == "anitescu":
+            given = dict(zip(("gap", "normal", "tangent", "friction"), contacts[:4], strict=True)) | free._asdict()
+            given |= {"other_gap": rows.gap, "other_normal": rows.normal, "bound": rows.bound, "effect": effect}
+            given |= {"turn": self.tangent, "rest": rest, "x": self.x, "soft": soft, "cap": caps}
+            given = {name: none if v is None else np.ascontiguousarray(v) for name, v in given.items()}
+            (n, n_x), n_u, n_bounded = self.x.shape, free.B.shape[-1], rows.bound.shape[1] + caps.shape[1]
+            m = complementarity.count_forces(contacts.tangent.shape[1], contacts.tangent.shape[2], cone, k, n_bounded)
+            sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
+            found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
+            threads = max(1, min(n, torch.get_num_threads()))
+            definite = _mujoco.assemble(threads, complementarity.DRAG, length, force, given | {"E": found["E"]}, found)
+            found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
+        else:
+            along, definite = self._of_state(rows.normal), False
+            first, last = (None, None) if effect is None else (effect[:, :, :k], effect[:, :, k:])
+            limits = Unilateral(*_tensors(rows.gap[:, :k], along[:, :k], first))
+            held = Bounded(*_tensors(rows.gap[:, k:], along[:, k:], -rows.bound, rows.bound, last))
+            x, mu, soft, rest = _tensors(self.x, contacts.friction, soft, rest)
+            of_contacts, moves = self.contacts(contacts), FreeMotion(*_tensors(*free))
+            found = complementarity.assemble_lcs(
+                of_contacts, moves, x, mu, soft, cone, length, force, rest, limits, held
+            )
+        check_finite(found)
+        if not definite:
+            check_positive_definite(found["F"])
+        own = {name: v for name, v in found.items() if v.ndim > len(SYSTEM[name])}  # others are shared
+        return LCSParams.of_checked(found | {name: self.batched(v) for name, v in own.items()})
 
     def to_dofs(self, response: Any) -> Any:
         """Convert a response (..., nv, nv) of the positions of the state to one of the degrees of freedom."""
@@ -69,4 +97,9 @@ class Readings(NamedTuple):
             rows = rows @ (self.tangent if rows.ndim == 3 else self.tangent[:, None])
         if still := self.x.shape[-1] - rows.shape[-1]:
             rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1)
-        return self.batched(rows)
+        return rows
+
+
+def _tensors(*values: Any) -> list[Any]:
+    """Convert arrays to tensors; None stays."""
+    return [None if v is None else torch.from_numpy(v) for v in values]

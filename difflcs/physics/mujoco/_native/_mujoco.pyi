@@ -76,4 +76,12 @@ def solve_forces(
     lam: np.ndarray,
     found: np.ndarray,
 ) -> None: ...
+def assemble(
+    threads: int,
+    drag: float,
+    length: float,
+    force: float,
+    given: Mapping[str, np.ndarray],
+    found: Mapping[str, np.ndarray],
+) -> bool: ...
 def push(R: np.ndarray, rows: np.ndarray, forces: np.ndarray, by: np.ndarray, moved: np.ndarray) -> None: ...

@@ -38,6 +38,13 @@ inline void add(double factor, const double* row, int n, double* __restrict into
   for (int k = 0; k < n; k++) into[k] += factor * row[k];
 }
 
+// into (m) = row (n) times a matrix (n, m). A row of contacts is mostly zeros.
+inline void multiply(const double* row, const double* matrix, int n, int m, double* into) {
+  std::fill_n(into, m, 0.0);
+  for (int v = 0; v < n; v++)
+    if (row[v] != 0) add(row[v], matrix + v * m, m, into);
+}
+
 // Overwrites b (n, m) by M⁻¹ b and M (n, n) by its factors, with row exchanges; false where M is singular.
 inline bool solve_dense(double* M, int n, double* b, int m) {
   for (int c = 0; c < n; c++) {

@@ -12,6 +12,7 @@
 #include <system_error>
 #include <thread>
 
+#include "assembly.hpp"
 #include "finder.hpp"
 #include "forces.hpp"
 #include "motion.hpp"
@@ -300,6 +301,45 @@ void solve_forces(double c, int threads, Array<const double> F, Array<const doub
   });
 }
 
+// Assembles systems of n states, of arrays of each state or of all by the names of `Given`, into those of `Matrices`.
+// Returns false where numbers have to say whether F + Fᵀ is positive definite.
+bool assemble(int threads, double drag, double length, double force, const nb::dict& f, const nb::dict& found) {
+  using In = Array<const double>;
+  const auto size = [&](const char* name, int axis) { return static_cast<int>(value<In>(f, name).shape(axis)); };
+  const int k = size("tangent", 1), t = size("tangent", 2), nv = size("tangent", 3), nx = size("x", 1);
+  const int others = size("other_gap", 1), held = size("bound", 1), caps = size("cap", 1), nu = size("E", 2);
+  const Layout s{nv, nx, nu, k, t, caps, others, held, length, force, drag};
+  const int all = s.forces();
+  const size_t n = size("x", 0);
+  std::vector<Given> given(n);
+  for (const auto& [name, field, size] : std::initializer_list<std::tuple<const char*, const double* Given::*, int>>{
+           {"gap", &Given::gap, k}, {"normal", &Given::normal, k * nv}, {"tangent", &Given::tangent, k * t * nv},
+           {"friction", &Given::friction, k}, {"turn", &Given::turn, nv * nv}, {"A", &Given::A, nx * nx},
+           {"B", &Given::B, nx * nu}, {"d", &Given::d, nx}, {"response", &Given::response, nx * nx},
+           {"x", &Given::x, nx}, {"soft", &Given::soft, k + others}, {"other_gap", &Given::other_gap, others},
+           {"other_normal", &Given::other_normal, others * nv}, {"effect", &Given::effect, nx * others},
+           {"bound", &Given::bound, held}, {"cap", &Given::cap, caps}, {"rest", &Given::rest, all}}) {
+    const auto numbers = value<In>(f, name);
+    const size_t step = numbers.size() == n * size ? size : 0;
+    check(step > 0 || numbers.size() == size || numbers.size() == 0);
+    for (size_t i = 0; i < n && numbers.size() > 0; i++) given[i].*field = numbers.data() + i * step;
+  }
+  std::vector<double*> into;
+  for (const auto& [name, size] : std::initializer_list<std::pair<const char*, int>>{
+           {"C", nx * all}, {"d", nx}, {"D", all * nx}, {"E", all * nu}, {"F", all * all}, {"c", all}}) {
+    const auto numbers = value<Array<double>>(found, name);
+    check(numbers.size() == n * size);
+    for (size_t i = 0; i < n; i++) into.push_back(numbers.data() + i * size);
+  }
+  std::atomic<bool> definite{true};
+  on_threads(std::max(threads, 1), n, [&](size_t, int64_t i) {
+    const Matrices to{into[i], into[n + i], into[2 * n + i], into[3 * n + i], into[4 * n + i], into[5 * n + i]};
+    if (!assemble_state(s, given[i], to)) definite = false;
+    return true;
+  });
+  return definite;
+}
+
 // Motion (n, nv, m) by which rows (n, k, nv) move by (n, k, m), by forces along others, with responses R (n, nv, nv).
 void push(Array<const double> R, Array<const double> rows, Array<const double> forces, Array<const double> by,
           Array<double> moved) {
@@ -338,5 +378,7 @@ NB_MODULE(_mujoco, m) {
         "Steps from many states. Returns where MuJoCo said an error.");
   m.def("solve_forces", &solve_forces, "c"_a, "threads"_a, "F"_a, "q"_a, "low"_a, "high"_a, "lam"_a, "found"_a,
         "Forces between bounds.");
+  m.def("assemble", &assemble, "threads"_a, "drag"_a, "length"_a, "force"_a, "given"_a, "found"_a,
+        "Systems of many states. Returns whether F + Fᵀ is positive definite for certain.");
   m.def("push", &push, "R"_a, "rows"_a, "forces"_a, "by"_a, "moved"_a, "Motion by forces that moves rows so far.");
 }

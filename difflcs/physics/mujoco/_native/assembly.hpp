@@ -1,0 +1,122 @@
+// The system of a state with Anitescu's cone, as `assemble_lcs` of complementarity.py makes it. A contact moves with few
+// degrees of freedom, so its rows are mostly zeros, which are left out of each product.
+#pragma once
+
+#include "forces.hpp"
+
+namespace difflcs::physics {
+
+constexpr double kRounding = 1e-12;  // of a trace, and of the largest of n sums: more than rounding
+
+// What all states have in common. A force has rows: the rays of contacts, then the normals of those with a cap, then
+// others, of which the last are bounded.
+struct Layout {
+  int nv, nx, nu, contacts, tangents, caps, others, bounded;
+  double length, force, drag;
+
+  int each() const { return tangents > 0 ? 2 * tangents : 1; }
+  int rows() const { return contacts * each() + caps + others; }
+  int forces() const { return rows() + bounded + caps; }
+};
+
+// Of a state, arrays as in `Readings.assemble`; without `turn`, `effect` and `rest` where there are none.
+struct Given {
+  const double *gap, *normal, *tangent, *friction, *turn, *A, *B, *d, *response, *x, *soft, *other_gap, *other_normal,
+      *effect, *bound, *cap, *rest;
+};
+
+struct Matrices {
+  double *C, *d, *D, *E, *F, *c;
+};
+
+// Whether a matrix (n, n) plus a multiple of one has positive eigenvalues only. It is overwritten.
+inline bool is_positive(double* M, int n, double shift) {
+  for (int c = 0; c < n; c++) {
+    const double pivot = M[c * n + c] + shift;
+    if (!(pivot > 0)) return false;
+    for (int i = c + 1; i < n; i++)
+      if (M[c * n + i] != 0) add(-M[c * n + i] / pivot, M + c * n + i, n - i, M + i * n + i);
+  }
+  return true;
+}
+
+// Writes the matrices of a state, zero before; false where only their numbers can say whether F + Fᵀ is positive definite.
+DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
+  const int nv = s.nv, nx = s.nx, rays = s.contacts * s.each(), m = s.rows(), all = s.forces(), first = m - s.bounded;
+  std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), along(nv), effect(nx), transposed(nv * nx);
+  const auto put = [&](int i, const double* row, bool counts, double apart, double compliance) {
+    double* to = &rows[i * nv];
+    g.turn == nullptr ? static_cast<void>(std::copy_n(row, nv, to)) : multiply(row, g.turn, nv, nv, to);
+    if (counts) std::copy_n(to, nv, &counted[i * nv]);
+    gap[i] = apart;
+    soft[i] = compliance;
+  };
+  for (int k = 0; k < s.contacts; k++) {
+    for (int r = 0; r < s.each(); r++) {
+      const int i = k * s.each() + r;
+      if (s.tangents > 0) put(i, g.tangent + (k * s.tangents + r / 2) * nv, false, 0.0, 0.0);
+      std::copy_n(&rows[i * nv], nv, along.data());
+      put(i, g.normal + k * nv, true, g.gap[k], g.soft[k]);
+      if (s.tangents > 0) add(r % 2 == 0 ? g.friction[k] : -g.friction[k], along.data(), nv, &rows[i * nv]);
+    }
+    if (k < s.caps) put(rays + k, g.normal + k * nv, true, g.gap[k], g.soft[k]);
+  }
+  for (int k = 0, i = rays + s.caps; k < s.others; k++, i++)
+    put(i, g.other_normal + k * nv, i < first, g.other_gap[k], g.soft[s.contacts + k]);
+  for (int v = 0; v < nx; v++)
+    for (int w = 0; w < nv; w++) transposed[w * nx + v] = g.response[v * nx + w];
+  for (int i = 0; i < m; i++) {
+    const int k = i - rays - s.caps;
+    if (k < 0 || g.effect == nullptr) {
+      multiply(&rows[i * nv], transposed.data(), nv, nx, effect.data());
+    } else {
+      for (int v = 0; v < nx; v++) effect[v] = g.effect[v * s.others + k];
+    }
+    for (int v = 0; v < nx; v++) into.C[v * all + i] = effect[v] * s.force;
+  }
+  double size = 0, largest = 0, softest = INFINITY;
+  for (int i = 0; i < m; i++) {
+    const double* row = &rows[i * nv];
+    for (int v = 0; v < nv; v++) along[v] = row[v] / s.length;
+    multiply(along.data(), into.C, nv, all, into.F + i * all);
+    multiply(along.data(), g.A, nv, nx, into.D + i * nx);
+    multiply(along.data(), g.B, nv, s.nu, into.E + i * s.nu);
+    for (int v = 0; v < nv; v++) into.D[i * nx + v] -= (row[v] - counted[i * nv + v]) / s.length;
+    into.c[i] = gap[i] / s.length + dot(along.data(), g.d, nv) - dot(&counted[i * nv], g.x, nv) / s.length;
+    if (g.rest != nullptr) into.c[i] -= soft[i] * g.rest[i] / s.force;
+    size += dot(along.data(), row, nv);
+    softest = std::min(softest, soft[i]);
+  }
+  for (int i = 0; i < m; i++) {
+    double* row = into.F + i * all;
+    for (int j = 0; j < i; j++) row[j] = into.F[j * all + i] = 0.5 * (row[j] + into.F[j * all + i]);
+    row[i] += soft[i];
+    largest = std::max(largest, row[i]);
+  }
+  std::copy_n(g.d, nx, into.d);
+  for (int k = 0; k < s.bounded; k++) {  // they become λ − bound
+    const double lower = -g.bound[k] / s.force;
+    for (int v = 0; v < nx; v++) into.d[v] += lower * into.C[v * all + first + k];
+    for (int i = 0; i < m; i++) into.c[i] += lower * into.F[i * all + first + k];
+  }
+  for (int k = 0, i = m; i < all; k++, i++) {
+    const bool is_cap = k >= s.bounded;
+    const int from = is_cap ? (k - s.bounded) * s.each() : first + k;
+    for (int j = from; j < from + (is_cap ? s.each() : 1); j++) {
+      into.F[j * all + i] = 1.0;
+      into.F[i * all + j] = -1.0;
+    }
+    into.F[i * all + i] = s.drag / into.F[from * all + from];
+    into.c[i] = (is_cap ? g.cap[k - s.bounded] : 2 * g.bound[k]) / s.force;
+  }
+  // What is rows R rowsᵀ with a positive R is no less than zero (an `effect` is another in the velocities alone), and the
+  // compliance is more than rounding.
+  double trace = 0;
+  for (int v = 0; v < nv; v++) trace += g.response[v * nx + v];
+  for (int v = 0; v < nv; v++)
+    for (int w = 0; w < nv; w++) transposed[v * nv + w] = 0.5 * (g.response[v * nx + w] + g.response[w * nx + v]);
+  const double off = kRounding * (trace * size * s.force + m * largest);
+  return softest > 2 * off && is_positive(transposed.data(), nv, kRounding * trace);
+}
+
+}  // namespace difflcs::physics
