@@ -164,6 +164,13 @@ def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     assert (after[:, 1] - 0.1 + 2 * after[:, 0]).abs().max() < 1e-9
 
 
+def test_a_weak_servo_does_not_move_what_an_equality_constraint_holds():
+    drive = '<actuator><position joint="a" kp="3000" kv="20" forcerange="-1 1"/></actuator>'
+    model = load(BAR.format("a", 0, "") + BAR.format("c", 2, ""), drive + '<equality><weld body1="a"/></equality>')
+    module, x = MujocoLCS(model, motion="quasi-dynamic"), torch.zeros(2, dtype=torch.float64)
+    assert module.params(x).step(x, torch.tensor([0.2]).double()).x_next[0].abs() < 1e-9
+
+
 def test_what_is_driven_in_quasi_static_motion_stops_at_the_limits_of_its_joint():
     model, x = load(DRAWER.format(""), '<actuator><position joint="j" kp="9"/></actuator>'), torch.tensor([0.15])
     torch.testing.assert_close(MujocoLCS(model).action_bounds(x), (torch.tensor([-0.15]), torch.tensor([0.05])))

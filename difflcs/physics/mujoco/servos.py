@@ -104,6 +104,8 @@ class Servos:
         each = np.broadcast_to(rows, (n, *rows.shape))
         effect = free.response @ rows.T if step is None else step.effect(read.tangent, *2 * [of_step * each])
         gives = (rows * effect[:, :nv].swapaxes(-1, -2)).sum(-1)
+        moves = gives > 0  # not what equality constraints hold wholly
+        gives = np.where(moves, gives, 1.0)
         alone = self._seconds**2 * ((rows @ moved.inverse_mass) * rows).sum(-1)
         gain, bias, own = of.gain[those], of.bias[those], (of.gain * self._relative)[those]
         # Without the servo nothing gives way more than by its inertia.
@@ -117,7 +119,7 @@ class Servos:
             drives = np.where(acts, drives, gain)
             effect[:, nv : 2 * nv] = free.B[:, nv : 2 * nv, those] / drives[:, None]
         else:
-            force, acts = np.clip(rests, low, high) + along(reached - x) * bias, np.ones((n, k), dtype=bool)
+            force, acts = np.clip(rests, low, high) + along(reached - x) * bias, moves
         # τ by the state afterwards, the state before and the action, in units of the multipliers.
         after, before, by = np.zeros((n, k, n_x)), np.zeros((n, k, n_x)), np.zeros((n, k, nu))
         after[:, :, :nv], before[:, :, :nv] = -r[:, :, None] * rows, (r + bias + own)[:, :, None] * rows
