@@ -162,6 +162,8 @@ def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     after = module.params(x).step(x, torch.full((50, 1), 0.2).double()).x_next
     assert (after[:, 0] - x[:, 0] - 0.2).abs().max() < 1e-2
     assert (after[:, 1] - 0.1 + 2 * after[:, 0]).abs().max() < 1e-9
+    with pytest.warns(ContactWarning, match="move joint 'c' by 1"):
+        module.params(torch.tensor([0.0, 1.5, 0.5]).double())
 
 
 def test_a_weak_servo_does_not_move_what_an_equality_constraint_holds():

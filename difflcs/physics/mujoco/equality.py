@@ -13,11 +13,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from difflcs.errors import ContactWarning, warn
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco.native import copy_taken, flags, native
 
 Array = NDArray[np.float64]
 _FIRMEST = 1e-8  # least R, in parts of what it stands beside
+_FAR = 1.0  # motion to where constraints hold [m, rad], beyond which nothing about it is linear
 _ROUNDING = 1e-12  # part of the response without constraints, up to which something does not move
 _DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
 
@@ -103,6 +105,14 @@ class Equality:
         by = _push(response, E)
         along = np.eye(x.shape[1]) - by @ E
         back = by @ ((E @ x[:, :, None])[:, :, 0] - rows.gap)[:, :, None]
+        moved = np.abs(by @ rows.gap[:, :, None])
+        if (far := moved.max()) > _FAR:
+            joint = self.model.joint(self.model.dof_jntid[moved.max(0).argmax()])
+            warn(
+                f"expected equality constraints that nearly hold, got some that move joint {joint.name or joint.id!r} "
+                f"by {far:.3g} in a step, where nothing is linear: begin where they hold, or switch them off in data",
+                ContactWarning,
+            )
         d = (along @ d[..., None] + back)[:, :, 0]
         held = along @ response
         moves = np.diagonal(held, axis1=1, axis2=2) > _ROUNDING * np.trace(response, axis1=-2, axis2=-1)[..., None]
