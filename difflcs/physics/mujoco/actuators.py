@@ -47,8 +47,8 @@ class Actuators:
         follows: (nu,) True if it has no activation, or one that goes to its control.
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
-        usual: (nu,) size of actions where there is no range: 1; of a servo on a slide, for a metre, half as much again
-            as the joint's limits leave.
+        usual: (nu,) size of actions where there is no range: 1; of a servo on a slide, for a metre, two and a half
+            times what the joint's limits leave.
         reach: (nu,) size of actions: half of the range, or 1.
         brakes: (nv,) damping by drives on slides and hinges whose force is limited.
         gain, constant, bias, damping: (nu,) of the force: gain · control + constant + bias · length + damping · rate.
@@ -86,7 +86,7 @@ class Actuators:
         limited = model.jnt_limited[joints].astype(bool)
         width = np.ptp(model.jnt_range[joints], axis=1) * limited
         self._stops = np.where(limited & (self.dof >= 0) & stops, model.jnt_range[joints].T, [[-np.inf], [np.inf]])
-        self.usual = np.where(slides, 1.5 * np.abs(self.gear) * width, 1.0)
+        self.usual = np.where(slides, 2.5 * np.abs(self.gear) * width, 1.0)
         self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
