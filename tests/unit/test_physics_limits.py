@@ -167,10 +167,10 @@ def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
 
 
 def test_a_weak_servo_does_not_move_what_an_equality_constraint_holds():
-    drive = '<actuator><position joint="a" kp="3000" kv="20" forcerange="-1 1"/></actuator>'
-    model = load(BAR.format("a", 0, "") + BAR.format("c", 2, ""), drive + '<equality><weld body1="a"/></equality>')
-    module, x = MujocoLCS(model, motion="quasi-dynamic"), torch.zeros(2, dtype=torch.float64)
-    assert module.params(x).step(x, torch.tensor([0.2]).double()).x_next[0].abs() < 1e-9
+    weak = '<actuator><position joint="a" kp="3000" forcerange="-1 1"/></actuator>'
+    model = load(BAR.format("a", 0, "") + BAR.format("c", 2, ""), weak + '<equality><weld body1="a"/></equality>')
+    x, u = torch.zeros(2, dtype=torch.float64), torch.tensor([0.2], dtype=torch.float64)
+    assert MujocoLCS(model, motion="quasi-dynamic").params(x).step(x, u).x_next[0].abs() < 1e-9
 
 
 def test_what_is_driven_in_quasi_static_motion_stops_at_the_limits_of_its_joint():

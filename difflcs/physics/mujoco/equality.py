@@ -102,7 +102,8 @@ class Equality:
         matrices: Any = free
         A, B, d, response = matrices
         E = rows.normal if tangent is None else rows.normal @ tangent
-        by = _push(response, E)
+        pushed = response @ E.swapaxes(-1, -2)
+        by = pushed @ np.linalg.pinv(E @ pushed, _DEPENDENT, hermitian=True)  # which moves along rows by given ways
         along = np.eye(x.shape[1]) - by @ E
         back = by @ ((E @ x[:, :, None])[:, :, 0] - rows.gap)[:, :, None]
         moved = np.abs(by @ rows.gap[:, :, None])
@@ -118,9 +119,3 @@ class Equality:
         moves = np.diagonal(held, axis1=1, axis2=2) > _ROUNDING * np.trace(response, axis1=-2, axis2=-1)[..., None]
         matrices = along @ A, along @ B, d, held * moves[:, None] * moves[:, :, None]
         return FreeMotion(*matrices)
-
-
-def _push(response: Array, rows: Array) -> Array:
-    """Compute S Eᵀ (E S Eᵀ)⁺ (n, nv, k), the motion that moves along rows (n, k, nv) by given ways."""
-    pushed = response @ rows.swapaxes(-1, -2)
-    return pushed @ np.linalg.pinv(rows @ pushed, _DEPENDENT, hermitian=True)

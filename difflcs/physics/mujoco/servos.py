@@ -104,8 +104,7 @@ class Servos:
         each = np.broadcast_to(rows, (n, *rows.shape))
         effect = free.response @ rows.T if step is None else step.effect(read.tangent, *2 * [of_step * each])
         gives = (rows * effect[:, :nv].swapaxes(-1, -2)).sum(-1)
-        moves = gives > 0  # not what equality constraints hold wholly
-        gives = np.where(moves, gives, 1.0)
+        gives = np.where(moves := gives > 0, gives, 1.0)  # equality constraints may hold it wholly
         alone = self._seconds**2 * ((rows @ moved.inverse_mass) * rows).sum(-1)
         gain, bias, own = of.gain[those], of.bias[those], (of.gain * self._relative)[those]
         # Without the servo nothing gives way more than by its inertia.
