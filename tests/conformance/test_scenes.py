@@ -17,11 +17,11 @@ def test_a_step_of_a_random_scene_is_like_mujocos_or_says_why_not(first):
 # discrete steps; limits and equality constraints that fight each other or strong drives; a weld that gets firmer with
 # its load; a limit of force that hides an unstable drive; drives that press against what touches without a load; a
 # stiff servo that turns with its site; motion that diverges without constraints; friction that holds light joints; a
-# servo on a slide without a range, that pulls at a weld which gets 40 times as firm in a sixth of a millimetre, or that
-# brings about a contact; one that goes far beyond the limits of its slide.
+# servo on a slide without a range, that pulls at a weld which gets 40 times as firm in a sixth of a millimetre; one
+# that goes far beyond the limits of its slide.
 @pytest.mark.parametrize("seed", [
     204727, 221696, 212620, 206886, 211247, 217759, 211973, 224956, 600553, 721086, 722012, 748582, 756693, 771837,
-    207920, 700659, 883972, 906895, 910251, 901169, 981230, 983651])  # fmt: skip
+    207920, 700659, 883972, 906895, 910251, 901169, 983651])  # fmt: skip
 def test_a_scene_that_was_once_silent_is_not(seed):
     judged = scenes.judge(seed)
     assert judged

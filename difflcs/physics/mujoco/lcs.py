@@ -35,7 +35,6 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
-_TOUCHES = 2.0  # times the unit of gaps: how far a servo on a slide is tried that has no range and no such bounds
 _BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
@@ -357,8 +356,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
     likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
     bounds = torch.stack(of.action_bounds(x))  # which say how far such a servo goes, where a metre has too much force
-    touches = bounds.clamp(-_TOUCHES * of.length, _TOUCHES * of.length)
-    likely = torch.where(usual > 0, likely, torch.where(bounds.abs() > 1, touches, bounds))
+    likely = torch.where((usual > 0) | (bounds.abs() > 1), likely, bounds)
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
