@@ -263,10 +263,10 @@ void check_plans(const difflcs::MpcBatch& b, int64_t x, int64_t u, int64_t lam, 
 // Returns whether every problem is CONVERGED, so that callers can skip further checks.
 bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, int64_t groups,
-               int64_t sure, uint64_t seed, double homotopy, double shrink, double tol, int64_t max_iter, double certified, double time_limit,
-               int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> mu,
-               Output<double> objective, Output<double> residual, Output<int8_t> status, Output<int8_t> fragile,
-               Output<int32_t> iterations) {
+               int64_t sure, uint64_t seed, double homotopy, double shrink, double tol, int64_t max_iter,
+               double certified, double time_limit, int threads, Output<double> x, Output<double> u,
+               Output<double> lam, Output<double> mu, Output<double> objective, Output<double> residual,
+               Output<int8_t> status, Output<int8_t> fragile, Output<int32_t> iterations) {
   difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
   b.version = version_of(b);
   check_plans(b, x.size(), u.size(), lam.size(), mu.size());

@@ -69,7 +69,7 @@ class Readings(NamedTuple):
             sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
             found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
             threads = max(1, min(n, torch.get_num_threads()))
-            definite = _mujoco.assemble(threads, complementarity.DRAG, length, force, given | {"E": found["E"]}, found)
+            definite = _mujoco.assemble(threads, complementarity.DRAG, length, force, given, found)
             found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
         else:
             along, definite = self._of_state(rows.normal), False

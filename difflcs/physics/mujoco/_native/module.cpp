@@ -307,7 +307,8 @@ bool assemble(int threads, double drag, double length, double force, const nb::d
   using In = Array<const double>;
   const auto size = [&](const char* name, int axis) { return static_cast<int>(value<In>(f, name).shape(axis)); };
   const int k = size("tangent", 1), t = size("tangent", 2), nv = size("tangent", 3), nx = size("x", 1);
-  const int others = size("other_gap", 1), held = size("bound", 1), caps = size("cap", 1), nu = size("E", 2);
+  const int others = size("other_gap", 1), held = size("bound", 1), caps = size("cap", 1);
+  const int nu = static_cast<int>(value<Array<double>>(found, "E").shape(2));
   const Layout s{nv, nx, nu, k, t, caps, others, held, length, force, drag};
   const int all = s.forces();
   const size_t n = size("x", 0);
