@@ -442,10 +442,11 @@ class Inputs:
             if copy and name in SYSTEM and values[name].data_ptr() == tensor.data_ptr():
                 values[name] = value.clone()
         check_finite(unchecked)
+        coupled = {"Q", "R", "S"}.intersection(learned) if "S" in values else set()
+        if coupled:
+            check_convex_stages(values, self.by_stage)
         for name in learned:
-            if "S" in values and name != "Q_final":
-                check_convex_stages(values, self.by_stage)
-            else:
+            if name not in coupled:
                 check_convex(name, values[name])
         if unseen:
             check_positive_definite(values["F"])
