@@ -7,7 +7,7 @@ no option; and the environment is taken out of Gymnasium's wrappers, which since
 
 The reward of a step is sech²(15 d), with d [m] the distance of the cube's centre from the goal: at most 750 an episode.
 
-- contact-mpc: `trifinger_push.policy.PushPolicy`, from geometry and friction, no data;
+- contact-mpc: that of `examples/trifinger_push`, from geometry and friction, no data;
 - any other name is that of a policy class, as the evaluator takes it. The authors' expert is
   `trifinger_rl_example.example.TorchPushPolicy` of github.com/rr-learning/trifinger-rl-example, to be installed from
   there: it was trained by reinforcement learning in simulation.
@@ -18,6 +18,7 @@ Times are CPU times of the policy. The record of a policy is written after each 
 import contextlib
 import io
 import json
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from successes import success_figures
 from difflcs.cli.bench import machine, save
 from difflcs.errors import MissingDependencyError
 
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 OWN = "contact-mpc"
 KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
 """Of the statistics of an episode, as the evaluation calls them."""

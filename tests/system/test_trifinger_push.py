@@ -1,4 +1,4 @@
-"""The policy of `benchmarks/scoreboard/trifinger_push`: its geometry here, and the simulator where it is installed."""
+"""The policy of `examples/trifinger_push`: its geometry here, and the simulator where it is installed."""
 
 import sys
 

@@ -1,15 +1,10 @@
 """Pushing the cube of trifinger-rl-datasets by sampling-based contact MPC, without data.
 
-    cd benchmarks/scoreboard && python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.policy.PushPolicy
+    cd examples && python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.policy.PushPolicy
 
-- fingers.py: geometry of a finger, that of `examples/trifinger_lift.py`
+- fingers.py: geometry of a finger, that of `trifinger_lift.py`
 - control.py: torques that lead the tips along references
 - cube.py: where the cube is now, from a pose that is late
 - places.py: which finger could push where, and how it gets there
 - policy.py: `PushPolicy`, all of it together
 """
-
-import sys
-from pathlib import Path
-
-sys.path.append(str(Path(__file__).resolve().parents[3] / "examples"))

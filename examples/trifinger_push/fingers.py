@@ -1,4 +1,4 @@
-"""Geometry of the fingers of the TriFinger Pro, that of `examples/trifinger_lift.py`."""
+"""Geometry of the fingers of the TriFinger Pro, that of `trifinger_lift.py`."""
 
 import numpy as np
 import trifinger_lift
