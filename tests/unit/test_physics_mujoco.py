@@ -262,11 +262,14 @@ def test_a_tower_stands_on_four_contacts_a_face():
     model = tower(4)
     module = MujocoLCS(model, motion="dynamic", contacts=16, seconds=0.05)
     start = x = module.state.to_state(model.qpos0)
+    speeds = []
     for _ in range(8):
         x = module.params(x).step(x, torch.zeros(0).double()).x_next
-        assert float(x[24:].abs().max()) < 0.1  # as long as it settles; half a step of gravity is .25
+        speeds.append(float(x[24:].abs().max()))
+    assert max(speeds) < 0.1  # as long as it settles; half a step of gravity is .25
     assert float((x - start)[:24].abs().max()) < 3e-3
-    assert float(x[24:].abs().max()) < 1e-3
+    assert min(speeds) < 1e-4
+    assert speeds[-1] < 3e-3  # where rounding chooses other points of faces, MuJoCo's own tower moves by 2.5e-3
 
 
 @pytest.mark.parametrize("flag", ["contact", "constraint"])
