@@ -244,7 +244,7 @@ class MujocoLCS:
             free = self._equality.hold_positions(free, read.x, read.qpos, read.tangent)
             response = np.broadcast_to(read.to_dofs(free.response), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
-            rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
+            rows = scale(found, response, self._give)
         caps = self._caps.limit(contacts, loads, response, unit)
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])

@@ -6,13 +6,12 @@ brings about the acceleration a goes by
 
     v̇ = a + A/(A + R) (−b v − k d r − a),
 
-its part after a being a force within the bounds. Followed through a step this says how deep a limit is passed or how
-far friction creeps, when in the step the force acts, and whether it does so all the time.
+its part after a being a force within the bounds. Followed through a step, in `_native/nominal.hpp`, this says how deep
+a limit is passed or how far friction creeps, when in the step the force acts, and whether it does so all the time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -28,7 +27,6 @@ from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 MOST_LIMITS = 8  # by default
-_MOST_STEPS = 10  # in which a row is followed through a step
 _BALL, _SLIDE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -53,7 +51,7 @@ class Softness(NamedTuple):
 
     def yields(self, mass: Array | float, seconds: float) -> Array:
         """Speed (n, k) for a unit of force at which friction that holds creeps after a time, where A is `mass`."""
-        d = _find_impedance(self.impedance)(np.zeros_like(self.give))
+        d = self.impedance[..., 0].clip(1e-4, 0.9999)
         firm = (1 - d) / d * self.give
         rate = self.damping * mass / np.maximum(mass + firm, 1e-300)
         return firm / self.damping * -np.expm1(-rate * seconds)
@@ -242,28 +240,20 @@ class RowFinder:
             self._warn = False
 
 
-def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: float, seconds: float) -> ScaledRows:
+def scale(rows: Rows, response: Array, give: float) -> ScaledRows:
     """Scale rows so that a unit of force moves each as far as it moves contacts; those that cannot move get zeros.
 
     Args:
-        rows: the rows.
-        gap: (n, k) distance to where each holds.
-        part: (n, k) see `Followed`.
-        response: (n, nv, nv) what an impulse at the beginning of the step does to ζ.
+        rows: the rows, of motion without velocities.
+        response: (n, nv, nv) what a force does to the degrees of freedom.
         give: how far contacts move by it.
-        seconds: duration of the step [s], for bounds of impulses; 1 for those of forces.
     """
-    if not rows.gap.shape[1]:
-        return ScaledRows(rows.gap, rows.normal, rows.normal, rows.gap, rows.gap)
     gives = give_way(rows.normal, response)
     least = 1e-9 * (rows.normal**2).sum(-1) * np.trace(response, axis1=-2, axis2=-1)[:, None]
-    unit = np.where(gives > least, np.sqrt(give / np.where(gives > least, gives, 1.0)), 0.0) / part
-    impulse = unit[:, :, None] * rows.normal
-    of_friction = unit[:, unit.shape[1] - rows.n_friction :]
-    bound = (
-        seconds * rows.soft.bound[:, unit.shape[1] - rows.n_friction :] / np.where(of_friction > 0, of_friction, 1.0)
-    )
-    return ScaledRows(unit * part * gap, impulse * np.reshape(part, (*np.shape(part), 1)), impulse, bound, unit)
+    unit = np.where(gives > least, np.sqrt(give / np.where(gives > least, gives, 1.0)), 0.0)
+    along, of_friction = unit[:, :, None] * rows.normal, unit[:, unit.shape[1] - rows.n_friction :]
+    bound = rows.soft.bound[..., unit.shape[1] - rows.n_friction :] / np.where(of_friction > 0, of_friction, 1.0)
+    return ScaledRows(unit * rows.gap, along, along, bound, unit)
 
 
 def soften(
@@ -280,109 +270,6 @@ def soften(
 def give_way(rows: Array, response: Array) -> Array:
     """Compute how far a unit of force along each of rows (n, k, nv) moves it (n, k), by responses (n, nv, nv)."""
     return ((rows @ response) * rows).sum(-1)
-
-
-class Followed(NamedTuple):
-    """Soft rows (n, k) after a step.
-
-    Attributes:
-        moved: change of the gap, or of the way that rubs.
-        speed: v afterwards.
-        part: how far an impulse moves at the time in the step at which the row's force acts, of how far one at the
-            beginning would.
-        acts: True where there is a force.
-        holds: True where it acts all the time, within its bounds.
-        stops: True where it is within its bounds at the end of the step.
-    """
-
-    moved: Array
-    speed: Array
-    part: Array
-    acts: NDArray[np.bool_]
-    holds: NDArray[np.bool_]
-    stops: NDArray[np.bool_]
-
-
-class Load(NamedTuple):
-    """Motion of rows (n, k) without their own force: v̇ = a = acceleration − drag v.
-
-    Attributes:
-        acceleration: with v = 0.
-        drag: of what resists the motion of the row.
-        turn: part of the acceleration that is due to its Jacobian's change, J̇ ν, which MuJoCo's force does not resist.
-        mass: A, the inverse of the mass.
-    """
-
-    acceleration: Array
-    drag: Array
-    turn: Array
-    mass: Array
-
-
-def find_load(step: DynamicStep, rows: Array, bend: Array, after: Array, impulse: Array) -> Load:
-    """Find the load of rows (n, k, nv) that impulses (n, k) along them bring to velocities `after` (n, k) in a step."""
-    h, speed = step.seconds, (rows @ step.velocity[:, :, None])[:, :, 0]
-    mass, gives = (give_way(rows, S) for S in (step.inverse_mass, step.response))
-    drag = np.maximum(mass / np.maximum(gives, 1e-12 * mass + 1e-300) - 1, 0.0) / h
-    return Load(((after - gives * impulse) * (1 + h * drag) - speed) / h, drag, 2 * bend / h**2, mass)
-
-
-def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float, count: int) -> Followed:
-    """Follow soft rows (n, k) through a step.
-
-    Args:
-        gap: at its beginning.
-        speed: v at its beginning.
-        load: what moves and resists.
-        soft: MuJoCo's parameters.
-        seconds: duration of the step [s].
-        count: of MuJoCo's steps in it.
-    """
-    coarse = count > _MOST_STEPS
-    count = min(count, _MOST_STEPS)
-    h, limit = seconds / count, np.isinf(soft.bound)
-    free, drag, turn, mass = load._replace(mass=np.maximum(load.mass, 1e-300))
-    upper, slower = mass * soft.bound, 1 + h * drag
-    lower = np.where(limit, 0.0, -upper)
-    r, v, held, holds = gap.copy(), speed.copy(), np.ones_like(limit), np.ones_like(limit)
-    way = np.zeros((2, *gap.shape))  # by the force, and by the load
-    rate, total = np.zeros_like(way), np.zeros_like(gap)
-    impedance = _find_impedance(soft.impedance)
-    for i in range(count):
-        d = impedance(np.where(limit, np.abs(r), 0.0))
-        firm = mass / (mass + (1 - d) / d * soft.give)
-        spring, damping = firm * soft.stiffness * d, firm * (soft.damping - drag)
-        if coarse:  # steps that are longer than MuJoCo's are implicit
-            damping = damping + h * spring
-            then = damping * (v + h * free) / slower
-            force = -(firm * (free - turn) + spring * r + then) / (1 + h * damping / slower)
-        else:
-            force = -damping * v - spring * r - firm * (free - turn)
-        held = np.where(limit, (r < 0) & (force > 0), (lower < force) & (force < upper))
-        force = np.where(limit & (r >= 0), 0.0, np.clip(force, lower, upper))
-        v = (v + h * (free + force)) / slower
-        rate = (rate + h * np.stack([force, free])) / slower
-        r, way, total = r + h * v, way + h * rate, total + h * np.abs(force)
-        holds = holds & (held | (i == 0 < count - 1))  # what begins to touch holds as well
-    acts = total > 1e-12
-    # Where the load is carried, it acts at the beginning of the step as well.
-    far = way[0] - np.where(holds, seconds * rate[1] - way[1], 0.0)
-    part = np.where(acts, far / np.where(np.abs(rate[0]) > 1e-12, rate[0], 1.0), seconds) / seconds
-    return Followed(r - gap, v, part, acts, holds, held)
-
-
-def _find_impedance(parameters: Array) -> Callable[[Array], Array]:
-    """Return MuJoCo's impedance d as a function of depths (...), for solimp (..., 5)."""
-    least, most, width, middle, power = (parameters[..., i] for i in range(5))
-    width, middle, power = np.maximum(width, 1e-15), middle.clip(1e-4, 0.9999), np.maximum(power, 1.0)
-    below, above = middle ** (power - 1), (1 - middle) ** (power - 1)
-
-    def impedance(depth: Array) -> Array:
-        x = np.minimum(depth / width, 1.0)
-        y = np.where(x <= middle, x**power / below, 1 - (1 - x) ** power / above)
-        return (least + y * (most - least)).clip(1e-4, 0.9999)
-
-    return impedance
 
 
 def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -> tuple[Array, Array]:

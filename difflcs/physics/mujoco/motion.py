@@ -452,12 +452,6 @@ class DynamicStep(NamedTuple):
         nv = self.place.shape[1]
         return self.x[:, nv : 2 * nv]
 
-    def reached(self, carried: Array) -> list[Array]:
-        """Return ζ and ν (n, nv) afterwards with the nominal action, with `carried` added to motion without contact."""
-        after = self.step[:, : carried.shape[1]] + carried
-        reached, nv = _reached(after, self.velocity), self.place.shape[1]
-        return [reached[:, :nv], reached[:, nv:]]
-
     def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
         """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""
         motion, x, step = self.motion, self.x, self.step.copy()

@@ -16,6 +16,7 @@
 #include "finder.hpp"
 #include "forces.hpp"
 #include "motion.hpp"
+#include "nominal.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -301,6 +302,81 @@ void solve_forces(double c, int threads, Array<const double> F, Array<const doub
   });
 }
 
+// Of fields by their names the sizes, for each state.
+template <class T, class Row>
+using Fields = std::initializer_list<std::tuple<const char*, T* Row::*, int>>;
+
+// Points n rows at their numbers in arrays of each state or of all; what is empty is left out.
+template <class T, class Row>
+void bind(const nb::dict& f, Fields<T, Row> fields, std::vector<Row>& rows) {
+  const size_t n = rows.size();
+  for (const auto& [name, field, size] : fields) {
+    const auto numbers = value<Array<T>>(f, name);
+    const size_t step = numbers.size() == n * size ? size : 0;
+    check(step > 0 || numbers.size() == static_cast<size_t>(size) || numbers.size() == 0);
+    for (size_t i = 0; i < n && numbers.size() > 0; i++) rows[i].*field = numbers.data() + i * step;
+  }
+}
+
+// Evaluates n states at the nominal action. Returns in how many forces were not found exactly.
+int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
+  const auto size = [&](const char* name, int axis) {
+    return static_cast<int>(value<nb::ndarray<nb::device::cpu>>(f, name).shape(axis));
+  };
+  Common c{};
+  c.nv = size("tangent", 3);
+  c.nx = size("x", 1);
+  c.columns = size("step", 2);
+  c.contacts = size("tangent", 1);
+  c.tangents = size("tangent", 2);
+  c.rows = size("bend", 1);
+  c.bounded = value<int>(f, "bounded");
+  c.steps = value<int>(f, "steps");
+  c.opens = value<bool>(f, "opens");
+  for (auto [name, into] : {std::pair{"seconds", &c.seconds}, {"give", &c.give}, {"compliance", &c.compliance},
+                            {"usual", &c.usual}})
+    *into = value<double>(f, name);
+  check(size("rough", 0) == c.contacts && size("firm", 0) == c.nv && size("tree", 0) == c.nv &&
+        size("reach", 0) == c.columns - 1 - c.nx);
+  for (auto [name, into] : {std::pair{"rough", &c.rough}, {"firm", &c.firm}})
+    *into = value<Array<const bool>>(f, name).data();
+  for (auto [name, into] : {std::pair{"time", &c.time}, {"depth", &c.depth}, {"creep", &c.creep}, {"reach", &c.reach}})
+    *into = value<Array<const double>>(f, name).data();
+  c.tree = value<Array<const int64_t>>(f, "tree").data();
+  const size_t n = size("x", 0);
+  const int k = c.contacts, r = c.rows, nv = c.nv, t = c.tangents, of_step = c.nx * c.columns;
+  std::vector<Acting> given(n);
+  bind<const double, Acting>(
+      f, {{"gap", &Acting::gap, k}, {"normal", &Acting::normal, k * nv}, {"tangent", &Acting::tangent, k * t * nv},
+          {"friction", &Acting::friction, k}, {"soft", &Acting::soft, k}, {"row_gap", &Acting::row_gap, r},
+          {"row_normal", &Acting::row_normal, r * nv}, {"bend", &Acting::bend, r},
+          {"stiffness", &Acting::stiffness, r}, {"damping", &Acting::damping, r},
+          {"impedance", &Acting::impedance, 5 * r}, {"row_give", &Acting::row_give, r}, {"most", &Acting::most, r},
+          {"x", &Acting::x, c.nx}, {"step", &Acting::step, of_step},
+          {"delayed", &Acting::delayed, 2 * nv * c.columns}, {"response", &Acting::response, nv * nv},
+          {"inverse_mass", &Acting::inverse_mass, nv * nv}},
+      given);
+  const auto geom = value<Array<const int64_t>>(f, "geom");
+  check(geom.size() == 2 * n * k);
+  for (size_t i = 0; i < n; i++) given[i].geom = geom.data() + 2 * k * i;
+  std::vector<Evaluated> into(n);
+  bind<double, Evaluated>(
+      found,
+      {{"opened", &Evaluated::opened, k}, {"turned", &Evaluated::turned, k * t * nv},
+       {"forces", &Evaluated::forces, k * c.each()}, {"gap", &Evaluated::scaled_gap, r},
+       {"normal", &Evaluated::scaled_normal, r * nv}, {"impulse", &Evaluated::impulse, r * nv},
+       {"bound", &Evaluated::bound, c.bounded}, {"unit", &Evaluated::unit, r},
+       {"row_forces", &Evaluated::row_forces, r}, {"carried", &Evaluated::carried, 2 * nv * c.columns}},
+      into);
+  std::vector<Evaluation> memory(threads);
+  std::atomic<int> missed{0};
+  on_threads(threads, n, [&](size_t thread, int64_t i) {
+    missed += !memory[thread].run(c, given[i], into[i]);
+    return true;
+  });
+  return missed;
+}
+
 // Assembles systems of n states, of arrays of each state or of all by the names of `Given`, into those of `Matrices`.
 // Returns false where numbers have to say whether F + Fᵀ is positive definite.
 bool assemble(int threads, double drag, double length, double force, const nb::dict& f, const nb::dict& found) {
@@ -313,43 +389,24 @@ bool assemble(int threads, double drag, double length, double force, const nb::d
   const int all = s.forces();
   const size_t n = size("x", 0);
   std::vector<Given> given(n);
-  for (const auto& [name, field, size] : std::initializer_list<std::tuple<const char*, const double* Given::*, int>>{
-           {"gap", &Given::gap, k}, {"normal", &Given::normal, k * nv}, {"tangent", &Given::tangent, k * t * nv},
-           {"friction", &Given::friction, k}, {"turn", &Given::turn, nv * nv}, {"A", &Given::A, nx * nx},
-           {"B", &Given::B, nx * nu}, {"d", &Given::d, nx}, {"response", &Given::response, nx * nx},
-           {"x", &Given::x, nx}, {"soft", &Given::soft, k + others}, {"other_gap", &Given::other_gap, others},
-           {"other_normal", &Given::other_normal, others * nv}, {"effect", &Given::effect, nx * others},
-           {"bound", &Given::bound, held}, {"cap", &Given::cap, caps}, {"rest", &Given::rest, all}}) {
-    const auto numbers = value<In>(f, name);
-    const size_t step = numbers.size() == n * size ? size : 0;
-    check(step > 0 || numbers.size() == size || numbers.size() == 0);
-    for (size_t i = 0; i < n && numbers.size() > 0; i++) given[i].*field = numbers.data() + i * step;
-  }
-  std::vector<double*> into;
-  for (const auto& [name, size] : std::initializer_list<std::pair<const char*, int>>{
-           {"C", nx * all}, {"d", nx}, {"D", all * nx}, {"E", all * nu}, {"F", all * all}, {"c", all}}) {
-    const auto numbers = value<Array<double>>(found, name);
-    check(numbers.size() == n * size);
-    for (size_t i = 0; i < n; i++) into.push_back(numbers.data() + i * size);
-  }
+  bind<const double, Given>(
+      f, {{"gap", &Given::gap, k}, {"normal", &Given::normal, k * nv}, {"tangent", &Given::tangent, k * t * nv},
+          {"friction", &Given::friction, k}, {"turn", &Given::turn, nv * nv}, {"A", &Given::A, nx * nx},
+          {"B", &Given::B, nx * nu}, {"d", &Given::d, nx}, {"response", &Given::response, nx * nx},
+          {"x", &Given::x, nx}, {"soft", &Given::soft, k + others}, {"other_gap", &Given::other_gap, others},
+          {"other_normal", &Given::other_normal, others * nv}, {"effect", &Given::effect, nx * others},
+          {"bound", &Given::bound, held}, {"cap", &Given::cap, caps}, {"rest", &Given::rest, all}},
+      given);
+  std::vector<Matrices> into(n);
+  bind<double, Matrices>(found, {{"C", &Matrices::C, nx * all}, {"d", &Matrices::d, nx}, {"D", &Matrices::D, all * nx},
+                                 {"E", &Matrices::E, all * nu}, {"F", &Matrices::F, all * all}, {"c", &Matrices::c, all}},
+                         into);
   std::atomic<bool> definite{true};
   on_threads(std::max(threads, 1), n, [&](size_t, int64_t i) {
-    const Matrices to{into[i], into[n + i], into[2 * n + i], into[3 * n + i], into[4 * n + i], into[5 * n + i]};
-    if (!assemble_state(s, given[i], to)) definite = false;
+    if (!assemble_state(s, given[i], into[i])) definite = false;
     return true;
   });
   return definite;
-}
-
-// Motion (n, nv, m) by which rows (n, k, nv) move by (n, k, m), by forces along others, with responses R (n, nv, nv).
-void push(Array<const double> R, Array<const double> rows, Array<const double> forces, Array<const double> by,
-          Array<double> moved) {
-  const int64_t n = rows.shape(0), k = rows.shape(1), nv = rows.shape(2), m = by.shape(2);
-  check(R.size() == size_t(n * nv * nv) && forces.size() == rows.size() && by.size() == size_t(n * k * m) &&
-        moved.size() == size_t(n * nv * m));
-  for (int64_t i = 0; i < n; i++)
-    push_of(R.data() + i * nv * nv, rows.data() + i * k * nv, forces.data() + i * k * nv, by.data() + i * k * m,
-            static_cast<int>(k), static_cast<int>(nv), static_cast<int>(m), moved.data() + i * nv * m);
 }
 
 }  // namespace
@@ -381,5 +438,6 @@ NB_MODULE(_mujoco, m) {
         "Forces between bounds.");
   m.def("assemble", &assemble, "threads"_a, "drag"_a, "length"_a, "force"_a, "given"_a, "found"_a,
         "Systems of many states. Returns whether F + Fᵀ is positive definite for certain.");
-  m.def("push", &push, "R"_a, "rows"_a, "forces"_a, "by"_a, "moved"_a, "Motion by forces that moves rows so far.");
+  m.def("evaluate_nominal", &evaluate_nominal, "threads"_a, "given"_a, "found"_a,
+        "Contacts and rows at the nominal action. Returns in how many states forces were not found exactly.");
 }
