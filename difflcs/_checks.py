@@ -217,6 +217,12 @@ def all_finite(*values: Tensor) -> bool:
     return _kernels.all_finite([(v.detach() if v.requires_grad else v).numpy() for v in values])
 
 
+def numbers_of(tensor: Tensor) -> int | None:
+    """Return a number that says whether the numbers of a tensor have changed; None where they cannot be read."""
+    unread = transforms_active() or is_wrapped(tensor)
+    return None if unread else hash(tensor.detach().cpu().numpy().tobytes())
+
+
 def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], remedy: str = "") -> R:
     """Refuse anything but an object of a class, or of one of some classes."""
     if not isinstance(value, kind):

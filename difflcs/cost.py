@@ -21,9 +21,31 @@ _DIMENSIONS = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "cons
 _STAGES = ("Q", "R", "q", "r", "S")
 
 
-class _Quadratic(TensorFields):
+class _Weighted(TensorFields):
+    """Base of costs, whose weights are positive semi-definite together."""
+
+    _curved = ("Q", "R", "Q_final")
+    _checked: list[int | None] | None = None  # numbers of the last check; None where weights are never checked
+
+    def check_again(self) -> None:
+        """Refuse weights that were changed in place since they were checked, and have a negative eigenvalue now."""
+        if self._checked is None:
+            return
+        weights = {k: _checks.check_tensor(k, v) for k, v in self._held(self._curved).items() if v is not None}
+        now = [_checks.numbers_of(value) for value in weights.values()]
+        if now == self._checked and None not in now:
+            return
+        for name in ("Q_final",) if "S" in weights else weights:
+            check_convex(name, weights[name])
+        if "S" in weights:
+            check_convex_stages(weights, self.by_stage)
+        self._checked = now
+
+
+class _Quadratic(_Weighted):
     """Base of costs that are quadratic in states and actions."""
 
+    _curved = ("Q", "R", "Q_final", "S")
     Q: Tensor
     R: Tensor
     Q_final: Tensor
@@ -62,13 +84,10 @@ class _Quadratic(TensorFields):
         _checks.check_same_device(fields.items())
         if self.by_stage:
             check_stages({k: (fields[k], _DIMENSIONS[k], 0) for k in _STAGES if k in self.by_stage})
-        if check:
-            for name in ("Q_final",) if "S" in fields else ("Q", "R", "Q_final"):
-                check_convex(name, fields[name])
-            if "S" in fields:
-                check_convex_stages(fields, self.by_stage)
         for name in _DIMENSIONS:
             register(self, name, fields.get(name))
+        self._checked = [] if check else None
+        self.check_again()
 
     def tensors(self) -> dict[str, Tensor]:
         """Return name → tensor as it was passed, with the constants; S if there is one."""
@@ -253,7 +272,7 @@ def check_convex_stages(fields: Mapping[str, Tensor], by_stage: Collection[str])
     check_convex("[[Q, S], [Sᵀ, R]]", whole)
 
 
-class GoalCost(TensorFields):
+class GoalCost(_Weighted):
     """Maps a goal to a `QuadraticCost` whose linear terms are linear in the goal.
 
     cost(goal) has q = goal_to_q · goal, q_final = goal_to_q_final · goal and the constant ½ goalᵀ K goal, so that costs
@@ -315,6 +334,7 @@ class GoalCost(TensorFields):
         _checks.check_same_dtype(fields)
         for name, value in fields.items():
             register(self, name, value)
+        self._checked = []  # and so again in the first plan
 
     @_checks.takes_arrays
     def forward(self, goal: Tensor, horizon: int = 1) -> QuadraticCost:

@@ -22,10 +22,11 @@ from difflcs._checks import (
     check_tensor,
     describe,
     describe_shapes,
+    numbers_of,
     takes_arrays,
     to_tensor,
 )
-from difflcs._differentiation import is_wrapped, runs_eagerly, transforms_active
+from difflcs._differentiation import runs_eagerly
 from difflcs._linalg import matvec
 from difflcs._modules import fresh
 from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError
@@ -74,12 +75,6 @@ class SystemMatrices:
         """Compute D x + E u + c, plus F λ unless lam is None, (..., n_lam)."""
         gap = matvec(self.D, x) + matvec(self.E, u) + self.c
         return gap if lam is None else gap + matvec(self.F, lam)
-
-
-def _numbers_of(tensor: Tensor) -> int | None:
-    """Return a number that says whether the numbers of a tensor have changed; None where they cannot be read."""
-    unread = transforms_active() or is_wrapped(tensor)
-    return None if unread else hash(tensor.detach().cpu().numpy().tobytes())
 
 
 def index_batch(name: str, value: Tensor, batch: torch.Size, index: Any) -> Tensor:
@@ -135,14 +130,14 @@ class _Record(SystemMatrices):
         check_same_dtype(tensors)
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
-        vars(self)["_checked"] = _numbers_of(self.F)
+        vars(self)["_checked"] = numbers_of(self.F)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({describe_shapes(self.tensors())})"
 
     def check_again(self) -> None:
         """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
-        if (now := _numbers_of(self.F)) is not None and vars(self).get("_checked") != now:
+        if (now := numbers_of(self.F)) is not None and vars(self).get("_checked") != now:
             check_positive_definite(self.F)
             vars(self)["_checked"] = now
 
@@ -150,7 +145,7 @@ class _Record(SystemMatrices):
     def of_checked(cls, tensors: Mapping[str, Tensor], like: Self | None = None) -> Self:
         """Make a record of tensors that have been checked, all together, or with the F of `like`; it checks nothing."""
         record = object.__new__(cls)
-        vars(record).update(vars(like) if like is not None else {"_checked": _numbers_of(tensors["F"])}, **tensors)
+        vars(record).update(vars(like) if like is not None else {"_checked": numbers_of(tensors["F"])}, **tensors)
         return record
 
     def _rank(self, name: str) -> int:

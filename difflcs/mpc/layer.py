@@ -5,7 +5,7 @@ import time
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_choice, check_number, check_positive_int, takes_arrays
+from difflcs._checks import check_choice, check_kind, check_number, check_positive_int, takes_arrays
 from difflcs._differentiation import runs_eagerly
 from difflcs._fields import register
 from difflcs._modules import fresh
@@ -110,7 +110,7 @@ class LCSMPCLayer(nn.Module):
             for name, value in (("relaxation", relaxation), ("training_relaxation", training_relaxation))
         )
         self.barrier = check_number("barrier", barrier)
-        self.on_failure = check_choice("on_failure", on_failure, ("raise", "mask"))
+        self.on_failure = on_failure
         self.backend = get_backend(backend)
         self.constraints = None if constraints is None else check_constraints(constraints)
         self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
@@ -123,7 +123,14 @@ class LCSMPCLayer(nn.Module):
         self._repeat = Repeat()
 
     def setup(self) -> Setup:
-        """Collect the settings that the layer plans with now, except those of training mode."""
+        """Collect the settings that the layer plans with now, except those of training mode.
+
+        Raises:
+            InvalidInputError and its kinds: one that was set after the layer was made does not fit.
+        """
+        check_positive_int("passes", self.passes)
+        check_choice("on_failure", self.on_failure, ("raise", "mask"))
+        check_kind("backend", self.backend, Backend, "make one, such as BatchedBackend()")
         if self._forward_pre_hooks:
             fresh(self, ("u_min", "u_max"))
         return Setup(

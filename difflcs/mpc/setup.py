@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from difflcs._checks import (
     broadcast_batch,
@@ -22,15 +22,7 @@ from difflcs._checks import (
 from difflcs._differentiation import is_wrapped
 from difflcs._fields import check_not_nan
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound, check_bounds
-from difflcs.cost import (
-    CostModule,
-    CostSequence,
-    GoalCost,
-    QuadraticCost,
-    check_convex,
-    check_convex_stages,
-    cost_at,
-)
+from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost, cost_at
 from difflcs.errors import BoundsError, DTypeError, ShapeError
 from difflcs.mpc.backends.base import Backend
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
@@ -44,7 +36,6 @@ GUESS = {"x": (1, "n_x"), "u": (0, "n_u"), "lam": (0, "n_lam"), "mu": (1, "n_c")
 """Parts of a guess: how many stages beyond H each has, and its size."""
 
 SYMMETRIC = ("Q", "R", "Q_final")
-_CURVED = (*SYMMETRIC, "S")
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
 Bound = float | Tensor
@@ -301,6 +292,7 @@ class Inputs:
             else:
                 cost, goal = cost_along(cost, along, x0, goal, context), None
         self.check_sizes("cost", n_x=cost.n_x, n_u=cost.n_u)
+        cost.check_again()
         if isinstance(cost, GoalCost):
             if goal is None and reference is None:
                 raise ShapeError(
@@ -413,7 +405,7 @@ class Inputs:
             copy: whether to copy the system, so that a solution is measured by the one that it was planned with even
                 after a step of an optimiser.
         """
-        values, unchecked, learned, size = {}, {}, [], math.prod(batch)
+        values, unchecked, size = {}, {}, math.prod(batch)
         for name, tensor in tensors.items():
             value, by_stage = tensor.detach(), name in self.by_stage
             if value.dtype is not torch.float64 or not value.is_cpu:
@@ -431,8 +423,6 @@ class Inputs:
                 value = value.unsqueeze(0)
             if name in SYMMETRIC and not torch.equal(value, value.mT):
                 value = 0.5 * (value + value.mT)
-            if name in _CURVED and (isinstance(tensor, nn.Parameter) or (tensor.requires_grad and tensor.is_leaf)):
-                learned.append(name)  # an optimiser may have changed it
             if name in MAY_BE_INFINITE:
                 if unseen or tensor.requires_grad:
                     check_not_nan(name, value)
@@ -442,12 +432,6 @@ class Inputs:
             if copy and name in SYSTEM and values[name].data_ptr() == tensor.data_ptr():
                 values[name] = value.clone()
         check_finite(unchecked)
-        coupled = {"Q", "R", "S"}.intersection(learned) if "S" in values else set()
-        if coupled:
-            check_convex_stages(values, self.by_stage)
-        for name in learned:
-            if name not in coupled:
-                check_convex(name, values[name])
         if unseen:
             check_positive_definite(values["F"])
         return values

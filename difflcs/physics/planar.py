@@ -332,7 +332,7 @@ class PlanarPushing:
         if parts < self.shape.n_parts:
             kept = nearest.distance.detach().topk(parts, largest=False).indices
             nearest = nearest.select(kept)
-        gap = nearest.distance - torch.as_tensor(self.radius).unsqueeze(-1)
+        gap = nearest.distance - _number("radius", self.radius, 0.0).unsqueeze(-1)
         cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
 
         def turn(v: Tensor) -> tuple[Tensor, Tensor]:

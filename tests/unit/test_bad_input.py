@@ -203,6 +203,12 @@ def test_what_does_not_fit_is_refused(build, case):
     refuse(error, match, call, build)
 
 
+@pytest.mark.parametrize(("name", "value"), [("passes", 0), ("on_failure", "ignore"), ("backend", "batched")])
+def test_settings_that_were_changed_are_checked(build, name, value):
+    setattr(mpc := layer(build), name, value)
+    refuse(e.InvalidInputError, f"{name}: expected", mpc, X)
+
+
 @pytest.mark.parametrize("F", [-EYE, 0 * EYE, SKEW])
 def test_an_F_that_is_not_positive_definite_is_refused_with_its_eigenvalue(build, F):
     smallest = float(torch.linalg.eigvalsh(F + F.T)[0])

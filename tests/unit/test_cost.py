@@ -77,11 +77,11 @@ def test_a_weight_with_a_negative_eigenvalue_is_refused(build, name):
         InvalidInputError, match=f"{name}: expected a positive semi-definite.*{re.escape(f'{smallest:.3e}')}"
     ):
         QuadraticCost(**tensors)
-    for kind in (nn.Parameter, torch.Tensor.requires_grad_):
+    for kind in (nn.Parameter, torch.Tensor.requires_grad_, torch.Tensor.detach):
         learned = {**build.cost_tensors(0), name: kind(build.cost_tensors(0)[name])}
         mpc = LCSMPCLayer(build.params(), QuadraticCost(**learned), 3, -1.0, 1.0)
         with torch.no_grad():
-            learned[name].copy_(tensors[name])  # as an optimiser does
+            learned[name].copy_(tensors[name])  # as an optimiser does, or somebody who tries weights
         refuse(InvalidInputError, f"{name}: expected a positive semi-definite", mpc, torch.zeros(4).double())
 
 

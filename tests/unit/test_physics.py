@@ -550,6 +550,9 @@ def test_a_wrong_description_is_refused(wrong, error, match):
     refuse(DTypeError, "shape: expected Shape", PlanarPushing, "box", 0.01)
     with pytest.raises(InvalidInputError, match="compliance: expected numbers of at least 0"):
         pushing(drive=PositionDrive(1.0, -0.1)).params(torch.zeros(5, dtype=F64))
+    system = pushing(radius=(radius := tensor(0.1)))
+    radius.neg_()  # as an optimiser may do
+    refuse(InvalidInputError, "radius: expected numbers of at least 0", system.params, torch.zeros(5).double())
 
 
 def test_gradients_by_the_physics(build):

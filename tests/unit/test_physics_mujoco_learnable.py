@@ -158,6 +158,13 @@ def test_it_counts_rotations_from_where_things_are():
     torch.testing.assert_close(learned.params(x).d.detach(), before.detach())
 
 
+@pytest.mark.parametrize("value", [-800.0, 800.0, math.nan])
+def test_logarithms_without_a_factor_are_refused(value):
+    learned = LearnableMujocoLCS(scene(), learn=[("mass", "finger")], motion="quasi-dynamic", **OPTIONS)
+    learned.change.data.fill_(value)
+    refuse(InvalidInputError, f"change: .*{value}. of mass finger", learned.params, states(learned.n_x))
+
+
 @pytest.mark.parametrize(
     ("learn", "message"),
     [

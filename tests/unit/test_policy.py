@@ -38,7 +38,8 @@ def observations(*batch: int) -> TensorDict:
 def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     policy = LCSMPCPolicy(mpc, torch.tensor([0.01, 0.03], dtype=torch.float64))
     one = observations()
-    many = one.expand(4000).clone()
+    many, none = one.expand(4000).clone(), policy(observations(0))
+    assert (none["action"].shape, none["action_log_prob"].shape) == ((0, 2), (0,))
     with torch.no_grad(), torch.random.fork_rng():
         torch.manual_seed(0)
         policy(many)

@@ -57,6 +57,7 @@ _KINDS = {
 }
 _COUNTS = {"body": "nbody", "geom": "ngeom", "pair": "npair", "actuator": "nu", "joint": "njnt"}
 _STEP, _STATE_STEP = 3e-3, 1e-4  # of the differences: of parameters, which are of size 1, and of states and controls
+_LARGEST = 700  # of a logarithm whose factor is a number, and not zero
 _SIZED = (SPHERE, CAPSULE, CYLINDER, ELLIPSOID, BOX)
 
 
@@ -232,10 +233,15 @@ class LearnableMujocoLCS(nn.Module):
     def _changed(self, change: Array) -> Any:
         """Return a copy of the model with changed numbers."""
         model = copy.copy(self._model)
-        for kind, _, ids, start, count in self._entries:
+        for kind, name, ids, start, count in self._entries:
             part, of = change[start : start + count], _KINDS[kind]
-            for name, columns in of.fields:
-                values = _columns(model, name, columns)
+            if not (np.abs(part) < _LARGEST).all():
+                raise InvalidInputError(
+                    f"change: expected logarithms of factors, and offsets, from -{_LARGEST} to {_LARGEST}, got "
+                    f"{part.tolist()} of {kind} {name}; set them back, and learn in smaller steps"
+                )
+            for field, columns in of.fields:
+                values = _columns(model, field, columns)
                 if of.offset:
                     values[ids] += self._options["length"] * part
                 else:
@@ -257,9 +263,10 @@ class LearnableMujocoLCS(nn.Module):
         kept = self._built  # once: another thread may keep something else
         if kept[0] == key:
             return kept[1]
+        model = self._changed(change)
         factors = {e.kind: float(np.exp(change[e.start])) for e in self._entries if e.kind == "compliance"}
         compliance = self._options["compliance"] * factors.get("compliance", 1.0)
-        built = MujocoLCS(self._changed(change), self._data, **{**self._options, "compliance": compliance})
+        built = MujocoLCS(model, self._data, **{**self._options, "compliance": compliance})
         built.state = self.state
         built._asked = 1 << 62  # what actions do was tried with the first module
         built._servos.those = kept[1]._servos.those

@@ -117,6 +117,15 @@ class MLPGaussian(GaussianParameters):
         return self.write(tensordict, self.network.mean(*seen, context=tensordict.get(CONTEXT, None)))
 
 
+class _Gaussian(MultivariateNormal):
+    """A Gaussian of any batch: torch divides by the size of an empty one."""
+
+    deterministic_sample = MultivariateNormal.mean  # by TorchRL's name
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return super().log_prob(value) if value.numel() else value.sum(-1)
+
+
 class GaussianPolicy(ProbabilisticActor):
     """A TorchRL actor that draws from a Gaussian, as `difflcs.rl.PPO` needs it.
 
@@ -134,7 +143,7 @@ class GaussianPolicy(ProbabilisticActor):
             in_keys=["loc", "scale_tril"],
             out_keys=["action"],
             spec=Composite(action=Unbounded(torch.Size([n_u]), dtype=torch.float64)),
-            distribution_class=MultivariateNormal,
+            distribution_class=_Gaussian,
             distribution_kwargs={"validate_args": False},
             default_interaction_type=InteractionType.RANDOM,  # TorchRL's default is the mean
             return_log_prob=True,
