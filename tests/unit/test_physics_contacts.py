@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco import Distance, MujocoCost, MujocoLCS
+from difflcs.physics.mujoco.contacts import MujocoContacts
+from difflcs.physics.mujoco.limits import ScaledRows
 from difflcs.physics.mujoco.nominal import solve_forces
+from difflcs.physics.mujoco.readings import Readings
 from tests.conftest import refuse
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
@@ -239,3 +243,24 @@ def test_friction_of_one_on_both_sides_does_not_jam(motion, nearest):
     assert abs(moved[0] - true) < nearest * true
     assert moved[1] < 0.2 * true
     refuse(InvalidInputError, "caps: expected at most 6, got 7", MujocoLCS, model, motion="dynamic", caps=7)
+
+
+@pytest.mark.parametrize("all_of_it", [True, False])
+def test_the_system_of_cpp_is_that_of_torch(all_of_it):
+    """With rotations, rows with effects, bounded forces, caps and forces at rest, or without any of them."""
+    n, nv, contacts, others, bounded, caps = (3, 4, 3, 3, 2, 2) if all_of_it else (2, 4, 2, 0, 0, 0)
+    normal, size = np.random.default_rng(0).normal, np.random.default_rng(1).random
+    eye, half = np.eye(nv), normal(size=(n, nv, nv))
+    response = np.zeros((n, 2 * nv, 2 * nv))
+    response[:, :nv, :nv] = response[:, nv:, :nv] = half @ half.swapaxes(1, 2) + eye
+    turn = eye + 0.1 * normal(size=(n, nv, nv)) if all_of_it else None
+    read = Readings(torch.Size([n]), normal(size=(n, 2 * nv)), None, None, turn, None, None, None, None)
+    found = MujocoContacts(normal(size=(n, contacts)), normal(size=(n, contacts, nv)),
+                           normal(size=(n, contacts, 2, nv)), size((n, contacts)), None)  # fmt: skip
+    rows = ScaledRows(normal(size=(n, others)), along := normal(size=(n, others, nv)), along, size((n, bounded)), along)
+    free = FreeMotion(normal(size=(n, 2 * nv, 2 * nv)), normal(size=(n, 2 * nv, 2)), normal(size=(n, 2 * nv)), response)
+    effect = normal(size=(n, 2 * nv, others)) if all_of_it else None
+    rest = normal(size=(n, 4 * contacts + caps + others + bounded + caps)) if all_of_it else None
+    more = 50 + size((n, contacts + others)), "anitescu", 0.3, 0.7, rest
+    given = found, rows, free, effect, 0.1 + size((n, caps)), *more
+    torch.testing.assert_close(read.assemble(*given).tensors(), read.assemble_in_torch(*given))

@@ -58,8 +58,9 @@ class Readings(NamedTuple):
         All contacts have friction, up to their caps (n, n_caps). The rows are other constraints, the last of which are
         bounded, with an effect (n, n_x, k), see `Unilateral`. After that are arguments as of `assemble_lcs`.
         """
-        k, none, (soft, cone, length, force, rest) = rows.gap.shape[1] - rows.bound.shape[1], np.zeros(0), more
+        none, (soft, cone, length, force, rest) = np.zeros(0), more
         if cone == "anitescu":
+            k = rows.gap.shape[1] - rows.bound.shape[1]
             given = dict(zip(("gap", "normal", "tangent", "friction"), contacts[:4], strict=True)) | free._asdict()
             given |= {"other_gap": rows.gap, "other_normal": rows.normal, "bound": rows.bound, "effect": effect}
             given |= {"turn": self.tangent, "rest": rest, "x": self.x, "soft": soft, "cap": caps}
@@ -72,20 +73,27 @@ class Readings(NamedTuple):
             definite = _mujoco.assemble(threads, complementarity.DRAG, length, force, given, found)
             found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
         else:
-            along, definite = self._of_state(rows.normal), False
-            first, last = (None, None) if effect is None else (effect[:, :, :k], effect[:, :, k:])
-            limits = Unilateral(*_tensors(rows.gap[:, :k], along[:, :k], first))
-            held = Bounded(*_tensors(rows.gap[:, k:], along[:, k:], -rows.bound, rows.bound, last))
-            x, mu, soft, rest = _tensors(self.x, contacts.friction, soft, rest)
-            of_contacts, moves = self.contacts(contacts), FreeMotion(*_tensors(*free))
-            found = complementarity.assemble_lcs(
-                of_contacts, moves, x, mu, soft, cone, length, force, rest, limits, held
-            )
+            found, definite = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
         check_finite(found)
         if not definite:
             check_positive_definite(found["F"])
         own = {name: v for name, v in found.items() if v.ndim > len(SYSTEM[name])}  # others are shared
         return LCSParams.of_checked(found | {name: self.batched(v) for name, v in own.items()})
+
+    def assemble_in_torch(
+        self, contacts: MujocoContacts, rows: ScaledRows, free: FreeMotion, effect: Any, caps: Any, *more: Any
+    ) -> dict[str, torch.Tensor]:
+        """Compute the matrices of `assemble` by `assemble_lcs`, which takes every cone."""
+        k, (soft, cone, length, force, rest) = rows.gap.shape[1] - rows.bound.shape[1], more
+        first, last = (None, None) if effect is None else (effect[:, :, :k], effect[:, :, k:])
+        along = self._of_state(rows.normal)
+        limits = Unilateral(*_tensors(rows.gap[:, :k], along[:, :k], first))
+        held = Bounded(*_tensors(rows.gap[:, k:], along[:, k:], -rows.bound, rows.bound, last))
+        x, mu, soft, rest, caps = _tensors(self.x, contacts.friction, soft, rest, caps)
+        of_contacts, moves = self.contacts(contacts), FreeMotion(*_tensors(*free))
+        return complementarity.assemble_lcs(
+            of_contacts, moves, x, mu, soft, cone, length, force, rest, limits, held, caps
+        )
 
     def to_dofs(self, response: Any) -> Any:
         """Convert a response (..., nv, nv) of the positions of the state to one of the degrees of freedom."""
