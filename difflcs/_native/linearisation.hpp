@@ -78,7 +78,7 @@ class Linearisation {
     const auto F = data.F;
     const auto C = data.C;
     const LowRank& low_rank = problem.low_rank[k];
-    const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank;
+    const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank && !low_rank.skewed();
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
       a[i] = s[i] * stage.size[i];

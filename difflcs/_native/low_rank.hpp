@@ -4,6 +4,13 @@
 //
 // Forces move the state along C, and F - diag(rest) is what contacts feel of that: its rows are sums of rows of C. So
 // what F does across the rows of C is rest alone.
+//
+// Between some forces, such as caps of friction, and the others F may be skew: the caps t and the others h then have
+//   F = [diag(rest) + W W^T, B; -B^T, F_tt].
+// With g = (g_h, g_t) and d_t = a_t + b_t diag(F_tt), a solution x of (diag(a) + diag(b) F) x = g has
+//   x_h = (g_h - b_h (W y + B x_t)) / (a_h + b_h rest), and as unknowns remain y = W^T x_h and x_t, where
+//   d_t x_t = g_t + b_t (B^T x_h - (F_tt - diag(F_tt)) x_t).
+// So W has B as further columns, with zero in the rows t, and x_t as what these forces feel.
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
@@ -30,20 +37,25 @@ class LowRank {
   int64_t n, most;  // W has room for so many columns; none where this is not looked for
   Stages<Matrix<Vec, 0, 0>> columns, rows;
   Steps<Vec> rests;
+  Steps<int64_t> skews;
   Steps<LowRank> systems;  // each of them
   // Of the system in use: its numbers, 1 / (a + b rest), b, W scaled by b / (a + b rest), I + W^T that as factors.
   Matrix<Vec, 0, 0> W, W_t, scaled;
   Vec *rest, *inverse, *b, *capacitance, *left, *right;
   int64_t rank = 0;
+  // The forces t, the first of their columns in W, and of each force whether it is one of them.
+  int64_t *skew, skew_count = 0, skew_first = 0, *is_skew;
+  const double* F;
 
  public:
   void layout(Arena& arena, int64_t count, int64_t forces, bool wanted) {
     n = forces;
-    most = kLanes == 1 && wanted && n >= kLowRankFrom ? n / 2 / kRows * kRows : 0;
+    most = kLanes == 1 && wanted && n >= kLowRankFrom ? 5 * n / 8 / kRows * kRows : 0;
     if (most == 0) return;
     arena.take(columns, count, n, most);
     arena.take(rows, count, most, n);
     arena.take(rests, count, n);
+    arena.take(skews, count, 2 * n);
     arena.take(systems, count, 1);
     arena.take(scaled, n, most);
     arena.take(capacitance, most * most);
@@ -57,7 +69,8 @@ class LowRank {
   // Whether F is of this kind.
   explicit operator bool() const { return rank > 0; }
   // Whether it is not, of so many forces that they are always alone: some differ much in size from others.
-  bool unlike() const { return most > 0 && rank == 0 && n >= kAloneForces; }
+  bool unlike() const { return most > 0 && (rank == 0 || skewed()) && n >= kAloneForces; }
+  bool skewed() const { return skew_count > 0; }
 
   // Looks whether system k is of this kind.
   template <class Square, class Wide>
@@ -94,10 +107,14 @@ class LowRank {
           for (int64_t r = 0; r < kRows; r++) sum[r] += scaled(k, i + r) * read<V>(W[k], j);
         for (int64_t r = 0; r < kRows; r++) write<V>(capacitance + (i + r) * rank, j, sum[r]);
       });
-    for (int64_t i = 0; i < rank; i++) {
+    for (int64_t i = 0; i < rank; i++)
       for (int64_t j = 0; j < i; j++) capacitance[j * rank + i] = capacitance[i * rank + j];
-      capacitance[i * rank + i] += 1.0;
+    for (int64_t c = 0; c < skew_count; c++) {
+      Vec* row = capacitance + (skew_first + c) * rank;
+      for (int64_t m = 0; m < skew_count; m++) row[skew_first + m] += m == c ? 0.0 : F[skew[c] * n + skew[m]];
+      for (int64_t j = 0; j < rank; j++) row[j] *= b[skew[c]] * inverse[skew[c]];
     }
+    for (int64_t i = 0; i < rank; i++) capacitance[i * rank + i] += 1.0;
     lu_factor_by_panels(rank, capacitance);
   }
 
@@ -106,9 +123,11 @@ class LowRank {
     for (int64_t i = 0; i < n; i++) g[i] *= inverse[i];
     const Local<0> moved = feel(Local<0>(g));
     multiply(W, moved, [](int64_t) { return all(0); }, [&](int64_t i, Vec sum) { g[i] -= b[i] * inverse[i] * sum; });
+    for (int64_t c = 0; c < skew_count; c++) g[skew[c]] = moved[skew_first + c];
   }
 
-  // g becomes (diag(a) + F diag(b))^-1 g, where it has as many columns as V holds.
+  // g becomes (diag(a) + F diag(b))^-1 g, where it has as many columns as V holds. Not of a skewed F: what is lost to
+  // rounding there only makes a step of `solve`'s caller worse, which looks at the residual.
   template <class V = Vec>
   void solve_right(V* g) const {
     Local<0, V> forces(right);
@@ -120,13 +139,30 @@ class LowRank {
     multiply(W, moved, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { g[i] = g[i] - inverse[i] * sum; });
   }
 
+  // to = q + F x, by columns.
+  template <class Square>
+  void slack(const Square& F, Vec* x, const Vec* q, Vec* to) const {
+    reverse(x);
+    multiply_columns(F, x, q, to);
+    reverse(x);
+    for (int64_t c = 0; c < skew_count; c++) to[skew[c]] = 2.0 * q[skew[c]] - to[skew[c]];
+  }
+
  private:
   template <class V>
   Local<0, V> feel(const Local<0, V>& forces) const {
     Local<0, V> to(left);
     multiply(W_t, forces, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { to[i] = sum; });
+    for (int64_t c = 0; c < skew_count; c++) {
+      const int64_t i = skew[c];
+      to[skew_first + c] = b[i] * inverse[i] * to[skew_first + c] + forces[i];
+    }
     lu_solve_by_rows(rank, capacitance, to.v);
     return to;
+  }
+
+  void reverse(Vec* g) const {
+    for (int64_t c = 0; c < skew_count; c++) g[skew[c]] = -g[skew[c]];
   }
 
   void take(int64_t k, int64_t columns_of_W) {
@@ -136,21 +172,65 @@ class LowRank {
     W_t.rows = {rank};
     W.columns = {rank};
     rest = rests[k];
+    skew = skews[k];
+    is_skew = skew + n;
+  }
+
+  // F without what couples the forces t with others.
+  template <class Square>
+  struct Within {
+    const Square& F;
+    const int64_t* is_skew;
+    Vec operator()(int64_t i, int64_t j) const { return i == j || !(is_skew[i] || is_skew[j]) ? F(i, j) : 0.0; }
+  };
+
+  // Parts the forces such that F is symmetric within both parts and skew between them: t are the smaller part of each
+  // group of coupled forces. Returns whether there is such a partition.
+  template <class Square>
+  bool part(const Square& F) {
+    double* const side = reinterpret_cast<double*>(left);
+    int64_t* const group = reinterpret_cast<int64_t*>(right);
+    skew_count = 0;
+    for (int64_t i = 0; i < n; i++) side[i] = is_skew[i] = 0;
+    for (int64_t first = 0; first < n; first++) {
+      if (side[first] != 0) continue;
+      double balance = side[first] = 1;
+      int64_t count = 1;
+      group[0] = first;
+      for (int64_t at = 0; at < count; at++)
+        for (int64_t i = group[at], j = 0; j < n; j++) {
+          const double there = F(i, j), back = F(j, i), rounding = kRoundingInSum * (1 + __builtin_fabs(there));
+          const bool alike = __builtin_fabs(there - back) <= rounding, unlike = __builtin_fabs(there + back) <= rounding;
+          if (i == j || (alike && unlike)) continue;  // not coupled
+          const double other = alike ? side[i] : -side[i];
+          if (!(alike || unlike) || side[j] == -other) return false;
+          if (side[j] == 0) balance += side[group[count++] = j] = other;
+        }
+      for (int64_t at = 0; at < count; at++)
+        if (side[group[at]] * (balance + 0.5) < 0) is_skew[skew[skew_count++] = group[at]] = 1;
+    }
+    return true;
   }
 
   // Finds rest, rank and W; returns whether they are F to rounding.
   template <class Square, class Wide>
-  DIFFLCS_NOINLINE bool describe(const Square& F, const Wide& C) {
+  DIFFLCS_NOINLINE bool describe(const Square& whole, const Wide& C) {
+    F = whole.entries;
     rank = 0;
-    if (!read_rest(F, C) || !decompose(F)) return false;
-    for (; rank % kRows; rank++)
-      for (int64_t i = 0; i < n; i++) W(i, rank) = all(0);
+    if (!part(whole)) return false;
+    const Within<Square> F{whole, is_skew};
+    if (!read_rest(F, C) || !decompose(F) || rank + skew_count > most) return false;
+    skew_first = rank;
+    for (int64_t c = 0; c < skew_count || rank % kRows; c++, rank++)
+      for (int64_t i = 0; i < n; i++) W(i, rank) = c < skew_count && !is_skew[i] ? whole(i, skew[c]) : 0.0;
     for (int64_t i = 0; i < n; i++)
       for (int64_t m = 0; m < rank; m++) W_t(m, i) = W(i, m);
     Vec worst = all(0);
+    auto rows = W_t;
+    rows.rows = {skew_first};
     for (int64_t i = 0; i < n; i++) {
       for (int64_t j = 0; j < n; j++) right[j] = (i == j ? rest[i] : all(0)) - F(i, j);
-      multiply_columns(W_t, W[i], right, left);
+      multiply_columns(rows, W[i], right, left);
       for (int64_t j = 0; j < n; j++) worst = max(worst, abs(left[j]));
     }
     return !any(worst > kRoundingInSum);
@@ -167,7 +247,7 @@ class LowRank {
     for (int64_t r = 0; r < C.rows; r++) {
       Vec before = all(0), after = all(0);
       for (int64_t i = 0; i < n; i++) {
-        left[i] = all(0) + C(r, i);
+        left[i] = F.is_skew[i] ? 0.0 : C(r, i);
         before += left[i] * left[i];
       }
       for (int pass = 0; pass < 2; pass++) {
@@ -181,7 +261,8 @@ class LowRank {
       basis.columns = {++count};
     }
     for (int64_t i = 0; i < n; i++) {
-      multiply_columns(basis, F[i], none, right);
+      for (int64_t j = 0; j < n; j++) left[j] = F(i, j);
+      multiply_columns(basis, left, none, right);
       const Vec across = all(1) - basis.row(i) * basis[i], own = all(0) + F(i, i) - basis.row(i) * right;
       b[i] = select(across > kAcross, across, all(0));
       rest[i] = select(b[i] > 0, own / across, all(0));

@@ -147,8 +147,8 @@ class RelaxedLcp {
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
     Vec sum = all(0);
-    if (short_cut())  // F is symmetric: by columns, for several rows at a time
-      multiply_columns(F, next, q, &w_next[0]);
+    if (short_cut())
+      low_rank->slack(F, &next[0], q, &w_next[0]);
     else
       multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
     DIFFLCS_UNROLL

@@ -306,15 +306,19 @@ def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of
 
 
 @pytest.mark.parametrize("compliance", [0.3, 1e-4])
-@pytest.mark.parametrize("shared", [False, True])
-def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, compliance):
-    """Alone they are found in the size of what they move, side by side by elimination."""
+@pytest.mark.parametrize(("shared", "capped"), [(False, False), (True, False), (True, True)])
+def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, capped, compliance):
+    """Alone they are found in the size of what they move, side by side by elimination; also with caps of their sums."""
     n = build.normal(2)
     rows = n(3, 32, 8)
     rows[:, 2:, 6:] = 0.0  # of two states only the first two forces know
     if not shared:
         rows[:, 0, 7] = rows[:, 1, 6] = 0.0
-    F = rows @ rows.mT + torch.diag_embed(compliance * n(3, 32).exp())
+    caps = torch.zeros(32, 32).double()
+    if capped:
+        rows[:, 28:], caps[:24, 28:] = 0.0, torch.eye(4).double().repeat_interleave(6, 0)
+    F = rows @ rows.mT + torch.diag_embed(compliance * n(3, 32).exp()) + caps - caps.mT
+    F[:, 28, 29] = F[:, 29, 28] = F[:, 28, 29] - capped * 0.5 * (F[:, 28, 28] * F[:, 29, 29]).sqrt()
     A, B = 0.9 * torch.eye(8).double(), n(3, 8, 3)
     lcs = LCSParams(A=A.expand(3, 8, 8), B=B, C=rows.mT, d=0 * n(3, 8), D=rows @ A, E=rows @ B, F=F, c=n(3, 32))
     mpc = LCSMPCLayer(
