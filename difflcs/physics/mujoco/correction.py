@@ -38,6 +38,7 @@ _NEVER = 1e4  # times what moves: motion without constraints that grows beyond a
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
 _HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
+_NEARLY = 0.005  # of the median change with all actions: an error that is none
 _APART = 0.5  # [rad, m] in a step, by which joints go farther without constraints
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
@@ -216,6 +217,7 @@ def warn_of_wrong(
     change, alone = size(after - before), np.nan_to_num(size(free - before))
     alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0).min(0)
     moves = size(before) + alone
+    least = least + _NEARLY * np.nan_to_num(np.median(change, 0))  # near balance any error of large actions shows
     most = change + _FARTHER * moves + least
     held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
     excess = size(off) - np.where(held, 0.0, most)

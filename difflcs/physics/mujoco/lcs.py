@@ -36,6 +36,9 @@ from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
 _BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
+_TOUCHES = 0.03  # of the change of velocity: what constraints do where they do something
+_DECIMETRE = 0.1  # how far servos on slides are tried that have no limits [m]
+_FIRM = 0.01  # of how far a force parts bodies: what gives way by less, such as what mocap moves, is not tried so
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -168,7 +171,7 @@ class MujocoLCS:
         self._touching = copy.copy(model)
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
-            self._give, self._yields = _respond(self, limits != 0)
+            self._give, self._yields, self._usual = _respond(self, limits != 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is built again, as what is compiled holds addresses."""
@@ -329,8 +332,8 @@ class MujocoLCS:
         return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool), after)
 
 
-def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
-    """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
+def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any, Any]:
+    """Compute how far a unit of force parts bodies that may touch, a median; `Actuators.yields`; sizes of actions."""
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
     moved = of._motion.read(of._places, here, of._ctrl[None])
@@ -339,40 +342,83 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     far = h * response
     if limits and of.n_contacts and not of._quasi_static:
         of._servos.choose(far)
-    yields = of._actuators.yields(far, dynamic * response)
-    return median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2), yields
+    yields, usual = of._actuators.yields(far, dynamic * response), of._actuators.usual
+    give = median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2)
+    gives = np.diagonal(response)[of._actuators.dof] > _FIRM * give
+    return give, yields, torch.from_numpy(np.where((usual == 0) & gives, _DECIMETRE, usual))
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
-    """Warn where systems are far off with no control, at the ends of the ranges of actions, or between."""
+    """Warn where systems are far off with no control, at the ends of the ranges of actions, between, or in balance."""
     before, of._asked = of._asked, of._asked + len(read.x)
     due = of._actuators.curved.size > 0 or before.bit_length() < of._asked.bit_length()
     some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
-    if step is None or of._whole is None or not some.size:
+    if step is None or (whole := of._whole) is None or not some.size:
         return
-    x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
-    zero = of.control(x, torch.zeros_like(idle))
-    ends, usual = torch.from_numpy(of._actuators.range)[:, None] - zero, torch.from_numpy(of._actuators.usual)
-    other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
-    likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
-    bounds = torch.stack(of.action_bounds(x))  # which say how far such a servo goes, where a metre has too much force
-    likely = torch.where((usual > 0) | (bounds.abs() > 1), likely, bounds)
+    nv, x, bounds = of.state.nv, torch.from_numpy(read.x[some]), of.action_bounds(torch.from_numpy(read.x[some]))
+    flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
+    ways = (True, False) if of._motion.loosens else (True,)
+
+    def compare(u: Tensor) -> list[Any]:
+        """Velocities (k, m, n, nv) after actions (m, n, nu): of systems, in MuJoCo, in k ways without constraints."""
+        m, each = len(u), x.expand(len(u), *x.shape)
+        ctrl = of.control(each, u).reshape(m * len(some), of.n_u).numpy()
+        states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
+        after = whole.simulate(of._places, states, ctrl)
+        free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
+        predicted = predict(LCSParams.of_checked(flat), each, u).x_next.numpy()
+        return [v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free)]
+
+    u, low, high = _choose_actions(of, x, torch.from_numpy(step.idle[some]), bounds)
+    tried = compare(u)
+    balanced = u + _find_balance(step, some, tried[1][0], tried[2][0], (high - low).numpy())
+    more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
+    at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
+    bodies = read.moved.inverse_mass[some], of._motion.in_tree, of._model
+    warn_of_wrong(at[0], to[0], alone, step.velocity[some], *bodies)
+
+
+def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose actions (m, n, nu) within their bounds at states (n, n_x) with nominal ones; and ends of their ranges."""
+    zero, limited = of.control(x, torch.zeros_like(idle)), torch.from_numpy(of._actuators.usual > 0)
+    ends = torch.from_numpy(of._actuators.range)[:, None] - zero
+    other = torch.where(limited | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
+    likely = torch.stack([torch.minimum(idle, other) - of._usual, torch.maximum(idle, other) + of._usual])
+    forces = torch.stack(bounds)  # which say how far such a servo goes, where a metre has too much force
+    likely = torch.where(limited | (forces.abs() > 1), likely, forces)
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
     turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
     u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*bounds)
-    m, nv = len(u), of.state.nv
-    ctrl = of.control(x.expand(m, *x.shape), u).reshape(m * len(some), of.n_u).numpy()
-    states = np.tile(read.states[some], (m, 1))
-    after = of._whole.simulate(of._places, states, ctrl)
-    unstable, ways = np.tile(read.moved.unstable[some], m), (True, False) if of._motion.loosens else (True,)
-    free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
-    flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-    predicted = predict(LCSParams.of_checked(flat), x.expand(m, *x.shape), u).x_next.numpy()
-    at, to, alone = (v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
-    bodies = read.moved.inverse_mass[some], of._motion.in_tree, of._model
-    warn_of_wrong(at[0], to[0], alone, step.velocity[some], *bodies)
+    return u, low, high
+
+
+def _find_balance(step: DynamicStep, some: Any, after: Any, free: Any, size: Any) -> Tensor:
+    """Compute by how much actions miss balance, in which a tree of bodies that is in touch goes on as it is.
+
+    Near balance little decides what friction and contacts do. What drives alone do says where it is, for one tree of
+    bodies after the other, by the least change of actions in parts of their `size` (n, nu).
+
+    Args:
+        step: the step, of which `some` n states are meant.
+        some: their numbers.
+        after: (m, n, nv) velocities after m actions.
+        free: (m, n, nv) those without constraints. Where these change nothing, so does the balance.
+        size: see above.
+
+    Returns:
+        (2, m, n, nu) with all forces, and without those of constraints.
+    """
+    nv, n_x, before, in_tree = step.place.shape[1], step.x.shape[1], step.velocity[some], step.motion.in_tree
+    by_action, after, free = step.step[some, nv : 2 * nv, n_x:-1], np.nan_to_num(after), np.nan_to_num(free)
+    trees = in_tree.T[in_tree.T @ by_action.any((0, 2))]
+    trees = np.resize(trees, (len(after), 1, nv))
+    touches = np.abs(after - free).max(0) > _TOUCHES * np.abs(after - before).max(0)
+    weights = trees * (touches @ in_tree @ in_tree.T) * np.diagonal(step.inverse_mass[some], axis1=1, axis2=2) ** -0.5
+    change = weights * (np.stack([after, free]) - before)
+    back = np.linalg.pinv(weights[..., None] * by_action * size[:, None], 1e-6) @ change[..., None]
+    return torch.from_numpy(-size * back[..., 0])
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

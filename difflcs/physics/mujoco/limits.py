@@ -23,7 +23,7 @@ from difflcs.errors import ContactWarning, warn
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.motion import DynamicStep
-from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.native import flags, least_time
 
 Array = NDArray[np.float64]
 MOST_LIMITS = 8  # by default
@@ -276,8 +276,7 @@ def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -
     """Compute k and b (k,) of solref (k, 2) and solimp (k, 5); the first `of_limits` have a stiffness."""
     most = np.clip(impedance[:, 1], 1e-4, 0.9999)
     time, ratio = reference.T
-    safe = not model.opt.disableflags & flags("REFSAFE")
-    time = np.where(time > 0, np.maximum(time, 2 * model.opt.timestep * safe), time)
+    time = np.where(time > 0, np.maximum(time, least_time(model)), time)
     standard = time > 0
     inverse = 1 / np.where(standard, most * time, 1.0)
     stiffness = np.where(standard, (inverse / np.where(standard, ratio, 1.0)) ** 2, -time / most**2)

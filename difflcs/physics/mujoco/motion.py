@@ -32,7 +32,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response
+from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response, least_time
 
 Array = NDArray[np.float64]
 
@@ -281,8 +281,8 @@ class Dynamic:
         """A copy of the model as it was at first; equality constraints are as soft as in the model's own steps."""
         self._models.append(model := copy.copy(self.model))
         model.opt.disableflags = self._disabled | disabled
-        softened = (model.eq_solref[:, 0] > 0) & (not self._disabled & flags("REFSAFE"))
-        model.eq_solref[softened, 0] = np.maximum(model.eq_solref[softened, 0], 2 * model.opt.timestep)
+        softened = model.eq_solref[:, 0] > 0
+        model.eq_solref[softened, 0] = np.maximum(model.eq_solref[softened, 0], least_time(self.model))
         return model
 
     @cached_property

@@ -68,6 +68,13 @@ def flags(*names: str) -> int:
     return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
 
 
+def least_time(model: Any) -> float:
+    """Return the least time constant of constraints [s]: with `refsafe` two time steps, but for the "discrete" ones."""
+    discrete = int(getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1))
+    free = model.opt.integrator == discrete or model.opt.disableflags & flags("REFSAFE")
+    return 0.0 if free else 2.0 * model.opt.timestep
+
+
 def taken(data: Any) -> SimpleNamespace:
     """Copy the fields of a caller's data that are used."""
     return SimpleNamespace(**{name: np.array(getattr(data, name)) for name in TAKEN})

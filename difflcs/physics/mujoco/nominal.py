@@ -25,6 +25,7 @@ from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMiss
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Rows, ScaledRows, give_way
 from difflcs.physics.mujoco.motion import DynamicStep
+from difflcs.physics.mujoco.native import least_time
 
 Array = NDArray[np.float64]
 _USUAL = 0.02  # depth of contacts in parts of the length, under any load
@@ -81,7 +82,7 @@ class Recovery:
     def __init__(self, model: Any, length: float):
         self.usual = _USUAL * length
         (reference, ratio), impedance = model.geom_solref.T, np.clip(model.geom_solimp[:, :2], 1e-4, 0.9999).T
-        time = np.maximum(reference, 2 * model.opt.timestep)  # as MuJoCo's `refsafe`
+        time = np.maximum(reference, least_time(model))
         direct = impedance[1] ** 2 / np.maximum(-reference, 1e-9)
         stiffness = np.where(reference > 0, (impedance[1] * time * ratio) ** 2, direct)
         self.time, self.depth = np.sqrt(stiffness), stiffness * (1 - impedance[0]) / impedance[0] ** 2
