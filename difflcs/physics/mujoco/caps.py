@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from difflcs._checks import check_positive_int
 from difflcs.physics.complementarity import count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, count_points, find_moving
-from difflcs.physics.mujoco.correction import predict
 from difflcs.physics.mujoco.limits import give_way
 from difflcs.physics.mujoco.readings import Readings
 from difflcs.records import LCSParams
@@ -81,15 +80,14 @@ class Caps:
         pressed = np.any(joined & steep[:, None], -1)
         return np.where((load > 0) & ~pressed, _MOST * load, caps + _FREE * load)
 
-    def limit_by_forces(self, system: LCSParams, read: Readings, response: Array) -> LCSParams:
-        """Set the caps of a system without velocities by its own forces at the nominal action."""
-        if not (self.count and len(read.x)):
+    def limit_by_forces(self, system: LCSParams, lam: torch.Tensor, read: Readings, response: Array) -> LCSParams:
+        """Set the caps of a system without velocities by its own forces (..., n_lam) at the nominal action."""
+        if not self.count:
             return system
         n, rays = len(read.x), count_forces(len(self._rough), read.dof_contacts.tangent.shape[2])
-        x, u = (torch.from_numpy(read.batched(v)) for v in (read.x, read.moved.nominal))
-        lam = predict(system, x, u).lam.reshape(n, system.n_lam).numpy()
-        loads = lam[:, :rays].reshape(n, len(self._rough), -1).sum(-1)
-        loads[:, : self.count] += lam[:, rays : rays + self.count]
+        forces = lam.reshape(n, system.n_lam).numpy()
+        loads = forces[:, :rays].reshape(n, len(self._rough), -1).sum(-1)
+        loads[:, : self.count] += forces[:, rays : rays + self.count]
         c = system.c.clone()
         c[..., -self.count :] = torch.from_numpy(read.batched(self.limit(read.dof_contacts, loads, response, 1.0)))
         return LCSParams.of_checked({"c": c}, like=system)

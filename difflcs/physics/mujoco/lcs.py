@@ -26,7 +26,7 @@ from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
-from difflcs.physics.mujoco.nominal import Recovery, Situation
+from difflcs.physics.mujoco.nominal import Recovery, Situation, find_stiff, loosen
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.readings import Readings
@@ -81,7 +81,8 @@ class MujocoLCS:
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
         torsion: False to leave out the torsional friction of contacts with condim 4 or 6, two forces more for each.
         compliance: how far a contact gives way, as a fraction of how far the same force moves the two bodies apart (the
-            median over all pairs; in dynamic motion at least 0.01 of its own), > 0. It makes F + Fᵀ ≻ 0.
+            median over all pairs; at least 0.01 of its own in dynamic motion, and in quasi-dynamic motion if that is
+            not more than half the compliance), > 0. It makes F + Fᵀ ≻ 0.
         cone: model of friction, see `difflcs.physics.complementarity`.
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
@@ -256,7 +257,7 @@ class MujocoLCS:
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         soft = soften(rows, found, step, self._give, self.compliance, soft)
         system = read.assemble(contacts, rows, free, effect, caps, soft, self.cone, self.length, unit, rest)
-        system = self._caps.limit_by_forces(system, read, response) if step is None else system
+        system = self._rest_on_forces(system, read, response) if self.motion == "quasi-dynamic" else system
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
@@ -316,6 +317,16 @@ class MujocoLCS:
             bounds = self._actuators.bounds(numbers, speed, self._yields, self._relative)
         low, high = (torch.from_numpy(v).to(x) for v in bounds)
         return low, high
+
+    def _rest_on_forces(self, system: LCSParams, read: Readings, response: Any) -> LCSParams:
+        """Let contacts give way from their forces at the nominal action on, and set the caps of friction by these."""
+        rough, smooth = int(self._finder.rough.sum()), int((~self._finder.rough).sum()) + self._caps.count
+        more = find_stiff(system, count_forces(rough, self._finder.n_tangents, self.cone, smooth), self.compliance)
+        if not (len(read.x) and (self._caps.count or more.any())):
+            return system
+        x, u = (torch.from_numpy(read.batched(v)) for v in (read.x, read.moved.nominal))
+        lam = predict(system, x, u).lam
+        return self._caps.limit_by_forces(loosen(system, more, lam), lam, read, response)
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> Readings:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from difflcs.errors import ContactWarning, warn
 from difflcs.physics.complementarity import Cone, count_forces
@@ -26,6 +27,7 @@ from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Rows, ScaledRows, give_way
 from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.native import least_time
+from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
 _USUAL = 0.02  # depth of contacts in parts of the length, under any load
@@ -142,6 +144,20 @@ def solve_forces(
         F, q, low, high = (np.ascontiguousarray(values) for values in (F, q, low, high))
         _mujoco.solve_forces(compliance, threads, F, q, low, high, lam, found)
     return lam, found | (not q.size)
+
+
+def find_stiff(system: LCSParams, count: int, compliance: float) -> Tensor:
+    """Find how much compliance (..., count) the first forces of a system lack to have _LEAST, or half, of their own."""
+    firm = system.F.diagonal(dim1=-2, dim2=-1)[..., :count]
+    return (min(_LEAST, 0.5 * compliance) * (firm - compliance) - compliance).clamp(min=0.0)
+
+
+def loosen(system: LCSParams, more: Tensor, lam: Tensor) -> LCSParams:
+    """Add a compliance (..., count) to the first forces, which counts from the forces lam (..., n_lam)."""
+    F, c, count = system.F.clone(), system.c.clone(), more.shape[-1]
+    F.diagonal(dim1=-2, dim2=-1)[..., :count] += more
+    c[..., :count] -= more * lam[..., :count]
+    return LCSParams.of_checked({"F": F, "c": c}, like=system)
 
 
 def evaluate_nominal(at: Situation) -> Nominal:
