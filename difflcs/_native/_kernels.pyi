@@ -31,6 +31,7 @@ def solve_mpc(
     starts: int,
     groups: int,
     sure: int,
+    seeks: int,
     seed: int,
     homotopy: float,
     shrink: float,

@@ -170,6 +170,7 @@ void Controller::solve(Clock::time_point begun) {
                      &outcome_.residual, &status,        &fragile,         &outcome_.iterations};
   MpcEffort effort = data_.effort;
   if (guessed_) effort.starts = data_.starts_guessed;
+  if (effort.starts == 1) effort.seeks = 0;  // a plan that is followed
   Alone runner(workspace_.get(), begun, time_limit_);
   const auto started = Clock::now();
   search_.solve(data_.batch, guess, effort, out, runner);
@@ -202,7 +203,7 @@ void Controller::fall_back(double* u) {
 }
 
 void Controller::reserve(int64_t most) {
-  const Kernels& kernels = kernels_for(most * data_.effort.group());
+  const Kernels& kernels = kernels_for(most * data_.effort.jobs());
   MpcBatch batch = data_.batch;
   batch.count = most;
   std::unique_ptr<Many> many(new Many{MpcSearch(kernels), {}, {}});

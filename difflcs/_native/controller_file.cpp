@@ -152,6 +152,7 @@ ControllerData read_controller(const void* bytes, size_t size) {
   effort.starts = reader.size("starts", 1);
   effort.groups = reader.size("groups", 1);
   effort.sure = reader.size("sure", 1);
+  effort.seeks = reader.size("seeks", 0);
   data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);
   for (int i = 0; i < kInputs; i++) {

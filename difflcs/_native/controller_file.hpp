@@ -16,7 +16,7 @@
 
 namespace difflcs {
 
-constexpr uint32_t kControllerVersion = 2;
+constexpr uint32_t kControllerVersion = 3;
 
 // Numbers at a boundary of 64 bytes, zero at first.
 class Numbers {

@@ -263,7 +263,7 @@ void check_plans(const difflcs::MpcBatch& b, int64_t x, int64_t u, int64_t lam, 
 // Returns whether every problem is CONVERGED, so that callers can skip further checks.
 bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, int64_t groups,
-               int64_t sure, uint64_t seed, double homotopy, double shrink, double tol, int64_t max_iter,
+               int64_t sure, int64_t seeks, uint64_t seed, double homotopy, double shrink, double tol, int64_t max_iter,
                double certified, double time_limit, int threads, Output<double> x, Output<double> u,
                Output<double> lam, Output<double> mu, Output<double> objective, Output<double> residual,
                Output<int8_t> status, Output<int8_t> fragile, Output<int32_t> iterations) {
@@ -284,11 +284,11 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   if (b.count == 0) return true;
   const difflcs::MpcGuess guess{u_start ? u_start->data() : nullptr, lam_start ? lam_start->data() : nullptr,
                                 mu_start ? mu_start->data() : nullptr};
-  const difflcs::MpcEffort effort{starts, groups, sure, homotopy, shrink, tol, max_iter, certified, seed};
+  const difflcs::MpcEffort effort{starts, groups, sure, seeks, homotopy, shrink, tol, max_iter, certified, seed};
   const difflcs::MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
                               residual.data(), status.data(), fragile.data(), iterations.data()};
   Threads runner(threads, time_limit);
-  difflcs::MpcSearch(difflcs::kernels_for(b.count * effort.group())).solve(b, guess, effort, out, runner);
+  difflcs::MpcSearch(difflcs::kernels_for(b.count * effort.jobs())).solve(b, guess, effort, out, runner);
   return std::all_of(status.data(), status.data() + b.count,
                      [](int8_t code) { return code == int8_t(difflcs::Status::converged); });
 }
@@ -509,7 +509,7 @@ NB_MODULE(_kernels, m) {
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
         "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
-        "lam_start"_a.none(), "mu_start"_a.none(), "starts"_a, "groups"_a, "sure"_a, "seed"_a, "homotopy"_a,
+        "lam_start"_a.none(), "mu_start"_a.none(), "starts"_a, "groups"_a, "sure"_a, "seeks"_a, "seed"_a, "homotopy"_a,
         "shrink"_a, "tol"_a, "max_iter"_a, "certified"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,
         "objective"_a, "residual"_a, "status"_a, "fragile"_a, "iterations"_a,
         "Solve a batch of LCS-MPC problems into the given arrays. Returns whether all are CONVERGED.");

@@ -70,7 +70,7 @@ struct Shift {
   enum { all, begin, end } part;
   int64_t later;
 };
-constexpr int64_t kVaried = 8, kRounds = 4;
+constexpr int64_t kRounds = 4;
 constexpr Shift kShifts[kVaried] = {{Shift::all, 1}, {Shift::all, -1}, {Shift::all, 2},  {Shift::begin, 1},
                                     {Shift::end, 1}, {Shift::end, -1}, {Shift::all, -2}, {Shift::begin, -1}};
 // The other rounds draw. Half of their plans have a little noise, and begin at contact softer by ten to the power of
@@ -85,6 +85,12 @@ constexpr double kShortest = 0.05, kLongest = 0.6, kLeastPush = 0.25;  // a push
 // none.
 constexpr double kGain = 1e-3;
 constexpr int64_t kLong = 48, kFewVaried = 4, kSoftest = kVaried + 1;
+
+// After all groups contacts are sought round the best plan, kVaried at a time: the actions close a gap over at most
+// the part kHeld of the horizon, and in kOpened of the cases they open it. The part kMeltedSeeks begins at softer
+// contact, as pulses do. A gain of kGain begins the count of rounds in vain anew, up to kMostSeeks times as many in all.
+constexpr double kHeld = 0.4, kOpened = 0.3, kMeltedSeeks = 0.7;
+constexpr int64_t kMostSeeks = 4;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
@@ -215,6 +221,9 @@ int64_t finders(const double* reached, int64_t count, double one) {
   return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * std::abs(one); });
 }
 
+// Rounds that the local search of a long plan has besides those in vain that end it.
+int64_t longer(const MpcBatch& b, int64_t starts) { return starts * std::min(b.horizon, kLong) / kLong; }
+
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
   const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
@@ -255,7 +264,7 @@ MpcPlans MpcSearch::Store::plans() {
 }
 
 void MpcSearch::reserve(const MpcBatch& batch, const MpcEffort& effort) {
-  const int64_t jobs = effort.group() * batch.count;
+  const int64_t jobs = effort.jobs() * batch.count;
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
   reached.reserve(jobs);
@@ -267,6 +276,7 @@ void MpcSearch::reserve(const MpcBatch& batch, const MpcEffort& effort) {
   for (auto* v : {&agreed, &found, &ended}) v->reserve(batch.count);
   grouped.resize(batch, batch.count);
   origin.reserve(jobs);
+  closing.reserve(2 * batch.n_x);
 }
 
 // Calls the kernel for every problem of a batch.
@@ -304,7 +314,7 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
-  const int64_t chunk = std::max(kChunk, kJobs / effort.group());
+  const int64_t chunk = std::max(kChunk, kJobs / effort.jobs());
   MpcBatch searched = batch;
   const bool near = effort.starts == 1 && guess.lam;  // a plan with its forces, of the step before
   searched.relaxation = near ? batch.relaxation : softer(batch);
@@ -420,6 +430,11 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     const auto done = [&](int64_t e) { return agreed[e] >= kAgreed || found[e] >= effort.sure; };
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
+  if (effort.seeks == 0) return;
+  live.resize(count);
+  std::iota(live.begin(), live.end(), 0);
+  for (int64_t e : live) patience[e] = found[e] >= effort.sure ? 1 : effort.seeks;
+  improve(batch, effort, to, runner, first, count, true);
 }
 
 // Solves the elements `members` from those of the starts that begin with this one, with a guess for the very first.
@@ -480,7 +495,13 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   }
 
   finish(batch, guess, effort, out, runner, first);
-  improve(batch, effort, out, runner, first, count);
+  patience.assign(count, kRounds);
+  for (int64_t e : live) {
+    const double* own = reached.data() + e * starts;
+    const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;
+    if (lone) patience[e] = std::max(patience[e], longer(batch, starts) / 2);
+  }
+  if (starts >= kFixed) improve(batch, effort, out, runner, first, count, false);
 }
 
 // Solves those jobs to the end that are wanted. Returns their number: they are the first of `finished`, and `origin`
@@ -640,21 +661,50 @@ void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
   if (melted) tried.start[job].at_least *= power_of_ten(kMelted, kMeltedMore, random(drawn));
 }
 
-// Varies the plans of those elements that `search` left, and keeps what is better, until that gains nothing.
-void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
-                        int64_t first, int64_t count) {
-  const Sizes n(batch);
-  const bool few = effort.starts < kVaried;
-  const int64_t starts = effort.starts, more = starts * std::min(batch.horizon, kLong) / kLong;
-  const int64_t varied = few ? kFewVaried : kVaried, rounds = few ? 1 : 8 * starts;
-  idle.assign(count, 0);
-  patience.assign(count, kRounds);
-  for (int64_t e : live) {
-    const double* own = reached.data() + e * starts;
-    const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;
-    if (lone) patience[e] = std::max(patience[e], more / 2);
+// Sets the first actions of a job to those of a plan, except that some of them close the gap of a random contact over a
+// few stages as far as the bounds allow, or open it. The adjoint of that gap without contact says which way.
+void MpcSearch::seek(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
+  const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
+  const int64_t n_x = batch.n_x, n_u = batch.n_u, e = tried.element[job];
+  const double h = double(batch.horizon), spread = kGolden * double(kind) - std::floor(kGolden * double(kind));
+  const int64_t contact = int64_t(random(0) * double(batch.n_lam)), last = int64_t(spread * h);
+  const int64_t held = last - int64_t(random(1) * std::max(1.0, kHeld * h));
+  const int64_t begin = std::max(held - int64_t(random(2) * (h + 1.0)), int64_t{0});
+  const double way = random(3) < kOpened ? 1.0 : -1.0;
+  double* u = tried.u.data() + job * batch.horizon * n_u;
+  std::copy_n(plan, batch.horizon * n_u, u);
+  closing.assign(2 * n_x, 0.0);
+  for (int64_t k = last; k >= begin; k--) {
+    double *next = closing.data() + k % 2 * n_x, *now = closing.data() + (1 - k % 2) * n_x;
+    const double counts = k >= held ? way : 0.0;
+    for (int64_t j = 0; j < n_u; j++) {
+      const Bound bound(batch, e, k * n_u + j);
+      double slope = counts * batch.at(kE, e, k)[contact * n_u + j];
+      for (int64_t i = 0; i < n_x; i++) slope += next[i] * batch.at(kB, e, k)[i * n_u + j];
+      double& action = u[k * n_u + j];
+      const double far = kReach * (1.0 + std::abs(action));
+      if (slope > 0) action = bound.high < kHuge ? bound.high : action + far;
+      if (slope < 0) action = bound.low > -kHuge ? bound.low : action - far;
+    }
+    for (int64_t i = 0; i < n_x; i++) {
+      now[i] = counts * batch.at(kD, e, k)[contact * n_x + i];
+      for (int64_t l = 0; l < n_x; l++) now[i] += next[l] * batch.at(kA, e, k)[l * n_x + i];
+    }
   }
-  const auto done = [&](int64_t e) { return effort.starts < kFixed || !solved(out.status[e]); };
+  if (random(4) < kMeltedSeeks) tried.start[job].at_least *= power_of_ten(kSoftened, kSoftenedMore, random(5));
+}
+
+// Varies the plans of the elements `live`, or seeks contacts round them, and keeps what is better, until that has
+// gained nothing for as many rounds as their `patience`.
+void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+                        int64_t first, int64_t count, bool seeking) {
+  const Sizes n(batch);
+  const int64_t starts = effort.starts;
+  const bool few = !seeking && starts < kVaried;
+  const int64_t varied = few ? kFewVaried : kVaried;
+  const int64_t rounds = seeking ? kMostSeeks * effort.seeks : few ? 1 : 8 * starts;
+  idle.assign(count, 0);
+  const auto done = [&](int64_t e) { return !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   for (int64_t round = 0; round < rounds && !live.empty() && !runner.stopped(); round++) {
     // Job v * elements + i is variation v of the plan of the i-th element that is not done.
@@ -670,7 +720,10 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
-      vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
+      if (seeking)
+        seek(batch, effort, kind, out.u + e * n.u, j);
+      else
+        vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {
@@ -684,7 +737,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) {
         idle[e] = -1;
         ended[e] = 0;  // no start found it
-        patience[e] = std::max(kRounds, starts) + more;
+        if (!seeking) patience[e] = std::max(kRounds, starts) + longer(batch, starts);
       }
       copy_plan(n, finished.plans(), i, out, e);
     }

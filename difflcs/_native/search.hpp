@@ -9,18 +9,22 @@
 
 namespace difflcs {
 
+constexpr int64_t kVaried = 8;  // variations of a plan at a time
+
 // Effort of the search.
 struct MpcEffort {
   int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
   int64_t groups;   // in which they are searched one after the other; at least one
   int64_t sure;     // an element for which so many starts have found its best plan has no further group
+  int64_t seeks;    // rounds in vain that end the search for other contacts, one for such an element; 0: no such search
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
   int64_t max_iter;
   double certified;  // largest residual of a solved problem
   uint64_t seed;     // of the random starts
-  int64_t group() const { return (starts + groups - 1) / groups; }  // most starts of one
+  // Most starts of an element at a time.
+  int64_t jobs() const { return std::max((starts + groups - 1) / groups, seeks > 0 ? kVaried : 0); }
 };
 
 // The guess, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
@@ -104,8 +108,9 @@ class MpcSearch {
   bool apart(const MpcBatch& batch, int64_t job, const double* u) const;
   bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
   void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan, int64_t job);
+  void seek(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job);
   void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
-               int64_t count);
+               int64_t count, bool seeking);
   void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
   const Kernels& kernels;
@@ -116,6 +121,7 @@ class MpcSearch {
   std::vector<int64_t> agreed, found;         // how many groups and starts have found the best plan of each
   std::vector<int64_t> ended;                 // how many starts of one group have found the plan of the group
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
+  std::vector<double> closing;  // costates of a gap, at a stage and at the next
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };
 

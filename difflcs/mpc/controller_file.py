@@ -21,7 +21,7 @@ from difflcs.records import LCSParams, LCSSequence, system_at
 from difflcs.scales import ScaledLCS
 
 MAGIC = b"\x89LCS\r\n\x1a\n"
-VERSION = 2
+VERSION = 3
 _LARGEST = 2**53  # of whole numbers, so that a double holds it
 _MAPS = ("at", "along")
 

@@ -17,6 +17,7 @@ from difflcs._native import _kernels
 from difflcs.cli.bench import pushing_model
 from difflcs.errors import SolveWarning
 from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.backends.batched import Starts
 from difflcs.systems import cart_pole_between_walls, pushing_cost
 from tests.conftest import python
 
@@ -193,6 +194,26 @@ def test_another_group_of_starts_follows_where_few_of_them_find_the_plan(build):
     assert torch.equal(one.u[~unsure], more.u[~unsure])
     assert bool((more.objective <= one.objective).all())
     assert bool((more.objective < 0.999 * one.objective).any())
+
+
+class Seeking(BatchedBackend):
+    """As where many contacts are possible, with four starts."""
+
+    def starts(self, problem, guessed):
+        return Starts(4, 1, 3, 2)
+
+
+def test_contacts_are_sought_round_the_best_plan(build):
+    """Better plans make other contacts than those that four starts and a local search find."""
+    (x0, goal), mpc, plans = data(build, 64), pushing(build, 5), []
+    for mpc.backend in (BatchedBackend(restarts=4), Seeking()):
+        plans.append(mpc(x0, goal))
+    one, more = plans
+    assert bool((more.objective <= one.objective).all())
+    better = more.objective < 0.999 * one.objective
+    assert 1 <= int(better.sum()) <= 54
+    acting = [plan.lam[better] > 1e-2 for plan in (one, more)]
+    assert bool((acting[0] != acting[1]).any((1, 2)).any())
 
 
 def test_a_plan_that_creeps_along_kinks_is_not_lost():

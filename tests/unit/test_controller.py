@@ -483,11 +483,11 @@ def test_every_cut_and_every_flipped_bit_is_found(saved):
 
 
 def test_what_is_no_controller(saved, tmp_path):
-    other = forged(entries(saved.read_bytes()), version=3)
+    other = forged(entries(saved.read_bytes()), version=4)
     for content, message in (
         (b"", "0 bytes"),
         (b"A" * 100, "another kind of file"),
-        (other, "expected version 2 of the format, got 3"),
+        (other, "expected version 3 of the format, got 4"),
     ):
         saved.write_bytes(content)
         refuse(CheckpointError, message, MPCController.load, saved)
@@ -505,7 +505,7 @@ def entries(content):
     return found
 
 
-def forged(values, version=2):
+def forged(values, version=3):
     """A file with a checksum that matches, whatever is in it."""
     body = b"".join(
         struct.pack(f"<16sQ{len(v)}d", name.encode(), len(v), *v) if isinstance(v, list) else v
