@@ -139,7 +139,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
           M[i * n + j] = select(active[i] & active[j], all(0) + F[i * n + j], all(i == j ? 1 : 0));
         lam[i] = select(active[i], -q[i], all(0));
       }
-      lu_factor_by_rows<N>(n, M, rhs);
+      N == 0 ? lu_factor_by_panels(n, M) : lu_factor(n, M);
       solve(lam);
       // An active row has w = 0 up to rounding; refine where an ill-conditioned set leaves more.
       for (int refinement = 0;; refinement++) {

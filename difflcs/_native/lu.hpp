@@ -26,27 +26,6 @@ inline void lu_factor(N n, Matrix& M) {
   }
 }
 
-// The same numbers for a matrix too large for registers: each row is in them while it is eliminated. `n` is N where
-// that is not zero, `scratch` holds a row elsewhere.
-template <int64_t N>
-inline void lu_factor_by_rows(int64_t n, Vec* M, Vec* scratch) {
-  Local<N> row(scratch);
-  for (int64_t i = 0; i < n; i++) {
-    DIFFLCS_UNROLL
-    for (int64_t j = 0; j < n; j++) row[j] = M[i * n + j];
-    DIFFLCS_UNROLL
-    for (int64_t k = 0; k < n; k++) {
-      if (k == i) break;
-      row[k] *= M[k * n + k];
-      DIFFLCS_UNROLL
-      for (int64_t j = k + 1; j < n; j++) row[j] -= row[k] * M[k * n + j];
-    }
-    DIFFLCS_UNROLL
-    for (int64_t j = 0; j < n; j++) M[i * n + j] = row[j];
-    M[i * n + i] = 1.0 / M[i * n + i];
-  }
-}
-
 // The same numbers for a size that is not known when compiling. Four rows at a time eliminate all below them, which are
 // so read and written a quarter as often.
 DIFFLCS_NOINLINE inline void lu_factor_by_panels(int64_t n, Vec* M) {
@@ -130,16 +109,6 @@ DIFFLCS_NOINLINE void lu_solve_by_rows(int64_t n, const Vec* M, V* b) {
   for (; i > 0; i -= kRows) substitute_backward<kRows>(n, M, b, i - kRows);
 }
 
-template <class N>
-inline void lu_solve_transposed(N n, const Vec* M, Vec* b) {
-  for (int64_t i = 0; i < n; i++) {
-    for (int64_t j = 0; j < i; j++) b[i] -= M[j * n + i] * b[j];
-    b[i] *= M[i * n + i];
-  }
-  for (int64_t i = n - 2; i >= 0; i--)
-    for (int64_t j = i + 1; j < n; j++) b[i] -= M[j * n + i] * b[j];
-}
-
 // The same with row exchanges, lane by lane, for the few problems where elimination without them loses digits. Like
 // LAPACK, rows[k] is the row that was exchanged with row k.
 DIFFLCS_NOINLINE inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
@@ -203,7 +172,12 @@ struct Elimination {
       lu_solve(n, M, b);
   }
   DIFFLCS_INLINE void solve_transposed(int64_t n, const Vec* M, [[maybe_unused]] const Mask* rows, Vec* b) const {
-    lu_solve_transposed(n, M, b);
+    for (int64_t i = 0; i < n; i++) {
+      for (int64_t j = 0; j < i; j++) b[i] -= M[j * n + i] * b[j];
+      b[i] *= M[i * n + i];
+    }
+    for (int64_t i = n - 2; i >= 0; i--)
+      for (int64_t j = i + 1; j < n; j++) b[i] -= M[j * n + i] * b[j];
     if constexpr (kMayPivot)
       for (int64_t k = n - 1; pivot && k >= 0; k--) exchange(b, k, rows);
   }
