@@ -37,8 +37,8 @@ class Starts(NamedTuple):
 
 _STARTS = {
     "fast": (Starts(1, 1, 1), Starts(3, 1, 1)),
-    "default": (Starts(16, 4, 3), Starts(16, 1, 17, 12)),
-    "best": (Starts(64, 4, 4), Starts(64, 4, 65, 24)),
+    "default": (Starts(16, 4, 3), Starts(32, 2, 1)),
+    "best": (Starts(64, 4, 4), Starts(96, 6, 97, 24)),
 }
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
 # numbers: with four starts the worst costs 2.7 times the best on a row of four carts, 45 % more on a cart-pole, H 30.
@@ -78,7 +78,7 @@ class BatchedBackend(Backend):
     each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
     for long plans. Of four to seven starts only four of these are tried. Another group of starts is searched so where
-    few have found the best plan; that of all groups counts. Where many contacts are possible, others are sought round
+    few have found the best plan; that of all groups counts. Where many contacts are possible, "best" seeks others round
     it: the actions of a start close or open the gap of one contact for some stages as far as they can, and most such
     starts begin at softer contact.
 
@@ -87,10 +87,10 @@ class BatchedBackend(Backend):
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", up to four groups of four; "best", up to four of sixteen; 3, 16 and 4 × 16
-            where horizon × n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many optima.
-            There other contacts are sought until 12 rounds of eight starts find nothing better, 24 for "best". A guess
-            is the first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
+        effort: "fast", one start; "default", up to four groups of four; "best", up to four of sixteen; 3, 2 × 16 and
+            6 × 16 where horizon × n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many
+            optima. There "best" seeks contacts until 24 rounds of eight starts find nothing better. A guess is the
+            first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search,
             from 32 on in groups of sixteen until five end with the same plan.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
