@@ -270,9 +270,9 @@ def test_plans_of_many_contacts_get_more_starts():
 
     assert starts(5, 8, guessed=False) == [(1, 1), (16, 4), (64, 4)]
     assert starts(5, 8, guessed=True) == [(1, 1), (1, 1), (64, 4)]
-    assert starts(20, 5, guessed=False) == [(3, 1), (32, 2), (128, 8)]
-    assert starts(20, 5, guessed=True) == [(1, 1), (1, 1), (128, 8)]
-    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [(3, 1), (32, 2), (128, 8)]
+    assert starts(20, 5, guessed=False) == [(3, 1), (32, 2), (96, 6)]
+    assert starts(20, 5, guessed=True) == [(1, 1), (1, 1), (96, 6)]
+    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [(3, 1), (32, 2), (96, 6)]
     assert starts(10, 5, guessed=False, n_u=3) == [(1, 1), (16, 4), (64, 4)]
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [(5, 1)]
 

@@ -197,14 +197,14 @@ def correct(
 
 def warn_of_wrong(
     predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, in_tree: NDArray[Any], model: Any
-) -> None:
+) -> bool:
     """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
     Each tree of bodies counts by itself, as an object may be much lighter than the robot.
 
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
     without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv), and in_tree
-    (nv, n_trees) says which degree of freedom belongs to which tree.
+    (nv, n_trees) says which degree of freedom belongs to which tree. Returns whether it warned.
     """
     mass = np.linalg.inv(inverse_mass)
 
@@ -234,3 +234,4 @@ def warn_of_wrong(
             f"body {body.name or body.id!r}: take fewer seconds, less friction, or a nominal control near the actions",
             ContactWarning,
         )
+    return bool(wrong.any())

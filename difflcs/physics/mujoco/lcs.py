@@ -37,8 +37,6 @@ from difflcs.records import LCSParams, LCSSequence, sequence_along
 _TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
 _BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
 _TOUCHES = 0.03  # of the change of velocity: what constraints do where they do something
-_DECIMETRE = 0.1  # how far servos on slides are tried that have no limits [m]
-_FIRM = 0.01  # of how far a force parts bodies: what gives way by less, such as what mocap moves, is not tried so
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -172,7 +170,7 @@ class MujocoLCS:
         self._touching = copy.copy(model)
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
-            self._give, self._yields, self._usual = _respond(self, limits != 0)
+            self._give, self._yields = _respond(self, limits != 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is built again, as what is compiled holds addresses."""
@@ -343,8 +341,8 @@ class MujocoLCS:
         return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool), after)
 
 
-def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any, Any]:
-    """Compute how far a unit of force parts bodies that may touch, a median; `Actuators.yields`; sizes of actions."""
+def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
+    """Compute how far a unit of force moves two bodies apart that may touch, a median, and `Actuators.yields`."""
     model, data, nv, finder = of._model, of._data, of.state.nv, of._finder
     here = np.concatenate([data.qpos, data.qvel, data.act])[None]
     moved = of._motion.read(of._places, here, of._ctrl[None])
@@ -353,10 +351,8 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any, Any]:
     far = h * response
     if limits and of.n_contacts and not of._quasi_static:
         of._servos.choose(far)
-    yields, usual = of._actuators.yields(far, dynamic * response), of._actuators.usual
-    give = median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2)
-    gives = np.diagonal(response)[of._actuators.dof] > _FIRM * give
-    return give, yields, torch.from_numpy(np.where((usual == 0) & gives, _DECIMETRE, usual))
+    yields = of._actuators.yields(far, dynamic * response)
+    return median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2), yields
 
 
 def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
@@ -381,22 +377,24 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
         return [v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free)]
 
     u, low, high = _choose_actions(of, x, torch.from_numpy(step.idle[some]), bounds)
-    tried = compare(u)
-    balanced = u + _find_balance(step, some, tried[1][0], tried[2][0], (high - low).numpy())
+    bodies = step.velocity[some], read.moved.inverse_mass[some], of._motion.in_tree, of._model
+    at, to, alone = tried = compare(u)
+    if warn_of_wrong(at[0], to[0], alone, *bodies):
+        return
+    balanced = u + _find_balance(step, some, to[0], alone[0], (high - low).numpy())
     more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
     at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
-    bodies = read.moved.inverse_mass[some], of._motion.in_tree, of._model
-    warn_of_wrong(at[0], to[0], alone, step.velocity[some], *bodies)
+    warn_of_wrong(at[0], to[0], alone, *bodies)
 
 
 def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Choose actions (m, n, nu) within their bounds at states (n, n_x) with nominal ones; and ends of their ranges."""
-    zero, limited = of.control(x, torch.zeros_like(idle)), torch.from_numpy(of._actuators.usual > 0)
+    zero, usual = of.control(x, torch.zeros_like(idle)), torch.from_numpy(of._actuators.usual)
     ends = torch.from_numpy(of._actuators.range)[:, None] - zero
-    other = torch.where(limited | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
-    likely = torch.stack([torch.minimum(idle, other) - of._usual, torch.maximum(idle, other) + of._usual])
+    other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
+    likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
     forces = torch.stack(bounds)  # which say how far such a servo goes, where a metre has too much force
-    likely = torch.where(limited | (forces.abs() > 1), likely, forces)
+    likely = torch.where((usual > 0) | (forces.abs() > 1), likely, forces)
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
