@@ -433,7 +433,7 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
   if (effort.seeks == 0) return;
   live.resize(count);
   std::iota(live.begin(), live.end(), 0);
-  for (int64_t e : live) patience[e] = found[e] >= effort.sure ? 1 : effort.seeks;
+  patience.assign(count, effort.seeks);
   improve(batch, effort, to, runner, first, count, true);
 }
 

@@ -16,7 +16,7 @@ struct MpcEffort {
   int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
   int64_t groups;   // in which they are searched one after the other; at least one
   int64_t sure;     // an element for which so many starts have found its best plan has no further group
-  int64_t seeks;    // rounds in vain that end the search for other contacts, one for such an element; 0: no such search
+  int64_t seeks;    // rounds in vain that end the search for other contacts; 0: no such search
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient

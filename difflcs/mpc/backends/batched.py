@@ -26,7 +26,7 @@ class Starts(NamedTuple):
         starts: the number of all.
         groups: in which they are tried one after the other.
         sure: an element has no further group once so many starts have found its best plan.
-        seeks: rounds in vain that end the search for other contacts; one where `sure` starts have found the plan.
+        seeks: rounds in vain that end the search for other contacts; 0: no such search.
     """
 
     starts: int
@@ -38,7 +38,7 @@ class Starts(NamedTuple):
 _STARTS = {
     "fast": (Starts(1, 1, 1), Starts(3, 1, 1)),
     "default": (Starts(16, 4, 3), Starts(32, 2, 1)),
-    "best": (Starts(64, 4, 4), Starts(96, 6, 97, 24)),
+    "best": (Starts(64, 4, 4), Starts(96, 6, 96, 24)),
 }
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
 # numbers: with four starts the worst costs 2.7 times the best on a row of four carts, 45 % more on a cart-pole, H 30.
