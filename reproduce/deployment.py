@@ -4,13 +4,11 @@
 """
 
 import time
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
 from units import Unit
 
 from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy, write_atomically
@@ -64,22 +62,11 @@ class Deployments(Reporter):
         for protocol in self.protocols if goals else ():
             if protocol not in done:
                 start = time.perf_counter()
-                numbers = self.of_training(run, protocol, logged[-1], goals) or self.measure(run, protocol, goals)
+                numbers = self.measure(run, protocol, goals)
                 row = {"protocol": protocol, "minutes": minutes, **numbers, "seconds": time.perf_counter() - start}
                 new = pd.DataFrame([row])
                 known = pd.concat([known, new]) if len(known) else new
                 write_atomically(self.file, known.to_csv(index=False).encode())
-
-    def of_training(
-        self, run: RunDirectory, protocol: str, logged: Mapping[str, str], goals: int
-    ) -> dict[str, float] | None:
-        """Return the NUMBERS of the training's evaluation if it was the same: in a support as wide as the bounds."""
-        if protocol != "support" or logged["evaluation_goals"] != str(goals):
-            return None
-        pairs = zip(load_action_support(run), self.unit.spec.bounds, strict=True)
-        if not all(torch.equal(mine, full) for mine, full in pairs):
-            return None
-        return {name: float(logged[f"evaluation_{name}"]) for name in NUMBERS}
 
     def measure(self, run: RunDirectory, protocol: str, goals: int) -> dict[str, float]:
         """Compute the NUMBERS of one evaluation of the latest checkpoint."""

@@ -224,7 +224,7 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
 def write_tables(
     folder: Path, name: str, tables: Tables, notes: Sequence[str], figures: Mapping[str, str] | None = None
 ) -> None:
-    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md if it has their mark.
+    """Print tables with their notes; write them as Markdown, and into README.md if it has their mark.
 
     Args:
         folder: where to.
@@ -240,19 +240,10 @@ def write_tables(
     markdown = "\n".join(blocks) + "\n" + "\n".join(notes) + "\n"
     print(markdown)
     write_atomically(folder / f"{name}.md", markdown.encode())
-    latex = "\n".join(f"% {title}\n{_latex(table)}" for title, table in tables.items())
-    write_atomically(folder / f"{name}.tex", (latex + "\n" + "".join(f"% {note}\n" for note in notes)).encode())
-    print(f"written: {folder / name}.md, .tex")
+    print(f"written: {folder / name}.md")
     if folder.resolve() == records.RESULTS.resolve():
         pictures = "".join(f"![{shown}](results/{figure}.png)\n\n" for figure, shown in (figures or {}).items())
         update_readme(name, pictures + markdown)
-
-
-def _latex(table: pd.DataFrame) -> str:
-    text = table.to_latex(index=False, escape=True, column_format="l" + "c" * (table.shape[1] - 1))
-    for old, new in (("±", r"$\pm$"), ("−", "$-$"), ("<", "$<$"), (MISSING, "---")):
-        text = text.replace(old, new)
-    return text
 
 
 def update_readme(name: str, markdown: str) -> None:

@@ -84,20 +84,11 @@ class Case:
         """The same with other inputs."""
         return replace(self, arrays={**self.arrays, **arrays})
 
-    def stages(self, name: str, i: int) -> np.ndarray:
-        """One input of element i at every stage, or (1, ...) where all stages have the same."""
-        value = self.arrays[name]
-        own = value if self.shared(name) else value[i if len(value) > 1 else 0]
-        return own if own.ndim > rank(name) else own[None]
-
-    def element(self, i: int) -> dict[str, np.ndarray]:
-        """All inputs of element i, see `stages`."""
-        return {name: self.stages(name, i) for name in self.arrays}
-
     def at(self, name: str, i: int, k: int) -> np.ndarray:
         """One input of element i at stage k."""
-        value = self.stages(name, i)
-        return value[k if len(value) > 1 else 0]
+        value = self.arrays[name]
+        own = value if self.shared(name) else value[i if len(value) > 1 else 0]
+        return own[k] if own.ndim > rank(name) else own
 
     def problem(self):
         """The batch as the backends take it."""

@@ -527,10 +527,9 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
         else:
             code, _, _ = run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")
         assert (code == 0) or name not in shown
-        for suffix in ("md", "tex"):
-            written = tmp_path / f"{name}.{suffix}"
-            assert written.exists() == (name in shown)
-            assert name not in shown or written.read_text() == (tracked / f"{name}.{suffix}").read_text()
+        written = tmp_path / f"{name}.md"
+        assert written.exists() == (name in shown)
+        assert name not in shown or written.read_text() == (tracked / f"{name}.md").read_text()
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
 
 

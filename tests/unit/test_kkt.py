@@ -1,4 +1,4 @@
-"""mpc/kkt.py against judges that call nothing of it: the Lagrangian's derivative forwards along a rollout, in NumPy.
+"""mpc/kkt.py against judges that call nothing of it: the Lagrangian's derivative along a rollout, in NumPy.
 
 Its gradients, `kkt.vjp`, are compared with differences of plans and with those of the kernels in tests/conformance.
 """
@@ -9,8 +9,8 @@ import torch
 
 from difflcs.mpc import Primal, kkt
 from difflcs.mpc.backends import IpoptBackend
+from tests.conformance.hostile import checks
 from tests.conformance.varied.generators import random_case
-from tests.conformance.varied.judges import conditions, reduced_gradient
 
 
 def residual_of(problem, primal):
@@ -25,13 +25,12 @@ def test_the_reduced_gradient_is_that_of_the_lagrangian_along_the_rollout(build,
     x, lam = problem.rollout(u)
     mu = n(3, problem.horizon + 1, problem.n_c).abs() * torch.isfinite(problem.g)
     found = kkt.multipliers(problem, Primal(x, u, lam, mu)).gradient
-    for i in range(3):
-        trajectory = [v[i].numpy() for v in (x, u, lam)]
-        rolled = conditions(case, i, *trajectory, mu[i].numpy())
-        assert max(rolled["start"], rolled["dynamics"]) < 1e-12
-        assert rolled["complementarity"] < 1e-7
-        expected, size = reduced_gradient(case, i, *trajectory, mu[i].numpy())
-        assert float(np.abs((found[i].numpy() - expected) / size).max()) < 1e-9
+    t, trajectory = checks.by_stage(case), [v.numpy() for v in (x, u, lam)]
+    s, terms = checks.affine(t, "DEFc", *trajectory)
+    off = np.abs(trajectory[2] * s - case.relaxation) / (case.relaxation + 1e-7 * trajectory[2] * terms)
+    assert off.max(initial=0.0) < 1e-7
+    expected, size = checks.reduced_gradient(t, *trajectory, s, mu.numpy())
+    assert float(np.abs((found.numpy() - expected) / size).max()) < 1e-9
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from tests.conformance import judges
-from tests.conformance.cases import Case
+from tests.conformance.cases import Case, rank
 from tests.conformance.hostile.generators import LCP, Loss
 from tests.conformance.judges import mul
 
@@ -75,36 +75,48 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float) -
 # ---- MPC ------------------------------------------------------------------------------------------------------------
 
 
-def judge_mpc(problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray) -> Ratios:
-    """Promises of a solution whose status is CONVERGED or DEGENERATE.
+def judge_mpc(
+    problem: Case,
+    x: np.ndarray,
+    u: np.ndarray,
+    lam: np.ndarray,
+    objective: np.ndarray,
+    mu: np.ndarray | None = None,
+    violation: np.ndarray | None = None,
+) -> Ratios:
+    """Promises of a solution whose status is CONVERGED or DEGENERATE; `mu` and `violation` where there are rows.
 
     - start: x_0 is the caller's, exactly. bounds: u within them, exactly. sign: λ > 0.
     - dynamics: |x₊ − (Ax + Bu + Cλ + d)|_i ≤ 1e-6 of its terms.
     - complementarity: |λ_i s_i − ε| ≤ 1e-6 ε + 1e-13 λ_i · terms of s_i, s = Dx + Eu + Fλ + c.
+    - rows: each is met or paid for, or acts, to 2e-6 of its terms. price: 0 ≤ μ ≤ price. violation: the largest.
     - stationarity: a step of the whole width against the gradient, scaled by its terms, stays:
       |clip(u − width·g/G) − u| ≤ 1e-6 width. Free of units, and blind to no flat direction.
     - objective: the cost of the returned trajectory, to 1e-9 of its terms.
     - answer: the vertex of a linear program.
     """
     with np.errstate(all="ignore"):
-        a = problem.full()
-        low, high = a["u_min"][:, None], a["u_max"][:, None]
-        now, after = x[:, :-1], x[:, 1:]
-        predicted, next_terms = affine(a, "ABCd", now, u, lam)
-        s, s_terms = affine(a, "DEFc", now, u, lam)
-        cost, cost_terms = cost_of(problem, a, x, u, low, high)
-        relaxation = problem.relaxation
-        stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high)
+        t, relaxation = by_stage(problem), problem.relaxation
+        mu = np.zeros((*x.shape[:2], 0)) if mu is None else mu
+        low, high = t["u_min"], t["u_max"]
+        predicted, next_terms = affine(t, "ABCd", x, u, lam)
+        s, s_terms = affine(t, "DEFc", x, u, lam)
+        cost, cost_terms = cost_of(problem, t, x, u)
+        found = {}
+        if "g" in t and violation is not None:
+            found, fines, fine_terms = judge_rows(t, x, u, mu, violation, next_terms)
+            cost, cost_terms = cost + fines, cost_terms + fine_terms
+        stationary = stationarity(problem, t, x, u, lam, s, mu)
         if (stationary > 1).any():
             # Where the terms of s are so large that their rounding is all of s, its other reading is ε/λ.
-            other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high)
-            stationary = np.minimum(stationary, other)
+            stationary = np.minimum(stationary, stationarity(problem, t, x, u, lam, relaxation / lam, mu))
         return {
-            "finite": finite(x, u, lam, objective),
-            "start": np.where((x[:, 0] == a["x0"]).all(-1), 0.0, np.inf),
+            **found,
+            "finite": finite(x, u, lam, mu, objective),
+            "start": np.where((x[:, 0] == problem.arrays["x0"]).all(-1), 0.0, np.inf),
             "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
             "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
-            "dynamics": _ratio(np.abs(after - predicted), 1e-6 * next_terms),
+            "dynamics": _ratio(np.abs(x[:, 1:] - predicted), 1e-6 * next_terms),
             "complementarity": _ratio(np.abs(lam * s - relaxation), 1e-6 * relaxation + 1e-13 * lam * s_terms),
             "stationarity": stationary,
             "objective": _ratio(np.abs(objective - cost), 1e-9 * cost_terms),
@@ -112,78 +124,98 @@ def judge_mpc(problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, obje
         }
 
 
-def affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
-    """Left x + middle u + right λ + constant by four names, the same at all stages, and the sizes of its terms."""
-    t = by_stage(a)
+def by_stage(problem: Case) -> dict:
+    """Inputs of all elements with a dimension of stages after the batch, of one stage where all have the same."""
+    return {k: v if v.ndim == rank(k) + 2 else v[:, None] for k, v in problem.full().items()}
+
+
+def affine(t: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
+    """Left x + middle u + right λ + constant of the stages, by four names, and the sizes of its terms."""
+    x = x[:, :-1]
     return judges.affine(t, names, x, u, lam), judges.affine(judges.absolute(t), names, abs(x), abs(u), abs(lam))
 
 
-def by_stage(a: dict) -> dict:
-    """Inputs of elements with a dimension of stages after the batch."""
-    return {k: v[:, None] for k, v in a.items()}
-
-
-def cost_of(problem: Case, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
+def cost_of(problem: Case, t: dict, x, u) -> tuple[np.ndarray, np.ndarray]:
     """Cost of a trajectory and the sum of the sizes of its terms, (count,)."""
-    t = by_stage(a)
     total, terms = judges.cost(t, x, u), judges.cost(judges.absolute(t), abs(x), abs(u))
     if problem.barrier > 0:
-        logs = problem.barrier * (np.log(u - low) + np.log(high - u))
+        logs = problem.barrier * (np.log(u - t["u_min"]) + np.log(t["u_max"] - u))
         total, terms = total - logs.sum((1, 2)), terms + np.abs(logs).sum((1, 2))
     return total, terms
 
 
-def stationarity(problem: Case, a: dict, x, u, lam, s, s_terms, low, high) -> np.ndarray:
+def judge_rows(t: dict, x, u, mu, violation, next_terms) -> tuple[Ratios, np.ndarray, np.ndarray]:
+    """Promises of the rows; what their violations cost (count,), and how much of that may be rounding, times 1e9."""
+    c, terms, price = judges.rows(t, x, u), judges.rows(judges.absolute(t), abs(x), abs(u)), t["price"]
+    # A row whose terms are rounding is met to a part of the terms of its states and of the range of its actions.
+    range_, size = t["u_max"] - t["u_min"], np.maximum(abs(x[:, :1]), next_terms.max(1, keepdims=True))
+    efforts = np.maximum(abs(u), 1e-3 * np.where(np.isfinite(range_), range_, abs(u)))
+    size = np.maximum(terms, 1e-3 * mul(abs(t["G_x"]), size))
+    size[:, :-1] = np.maximum(size[:, :-1], 1e-3 * mul(abs(t["G_u"]), efforts))
+    unit = np.where(np.isfinite(c), size, 0.0).max(1, keepdims=True)
+    off = np.where(mu <= 0, np.maximum(c, 0), np.where(mu >= price, np.maximum(-c, 0), abs(c)))
+    over, there = np.maximum(c, 0.0), np.isfinite(c)
+    largest, room = over.max((1, 2)), np.where(there, terms, 0.0).max((1, 2))
+    paid = np.where(np.isfinite(price), price, 0.0)
+    # A price of 1e30 makes 1e14 of the rounding of a row that is held.
+    fine_terms = np.where(there, paid * (over + 1e-6 * terms), 0.0).sum((1, 2))
+    found = {
+        "rows": _ratio(off, 2e-6 * np.where(unit > 0, unit, 1.0)),
+        "price": np.where(((mu < 0) | (mu > price)).any((1, 2)), np.inf, 0.0),
+        "violation": _ratio(np.abs(largest - violation), 1e-9 * (1e-9 + room)),
+    }
+    return found, (paid * over).sum((1, 2)), 10 * fine_terms
+
+
+def stationarity(problem: Case, t: dict, x, u, lam, s, mu) -> np.ndarray:
     """The projected step against the reduced gradient, in units of the width, over its limit."""
-    g, terms = reduced_gradient(a, x, u, lam, s)
-    width = np.broadcast_to(high - low, u.shape)
-    last = np.concatenate([np.repeat(a["Q"][:, None], u.shape[1] - 1, 1), a["Q_final"][:, None]], 1)
-    curvature = (a["B"][:, None] * (last @ a["B"][:, None])).sum(2)
-    curvature = curvature + np.diagonal(a["R"], axis1=-2, axis2=-1)[:, None]
-    spread = 0.0
+    g, terms = reduced_gradient(t, x, u, lam, s, mu)
+    below, above, width = u - t["u_min"], t["u_max"] - u, np.broadcast_to(t["u_max"] - t["u_min"], u.shape)
+    closed, spread = np.isfinite(width), 0.0
+    width = np.where(closed, width, 1 + np.abs(u))
+    every = np.broadcast_to(t["Q"], (*u.shape[:2], *t["Q"].shape[2:]))
+    last = np.concatenate([every[:, 1:], t["Q_final"]], 1)
+    curvature = (t["B"] * (last @ t["B"])).sum(2) + np.diagonal(t["R"], axis1=-2, axis2=-1)
     if problem.barrier > 0:
-        below, above = u - low, high - u
         g = g + problem.barrier * (1 / above - 1 / below)
         terms = terms + problem.barrier * (1 / above + 1 / below)
         spread = problem.barrier * width / np.minimum(below, above) ** 2
-    G = np.maximum(terms, curvature * width)
-    G = np.where(G > 0, G, 1.0)
-    divisor = np.where(width > 0, width, 1.0)
+    G = np.maximum(terms, np.where(closed, curvature * width, 0.0))
+    G, divisor = np.where(G > 0, G, 1.0), np.where(width > 0, width, 1.0)
     # The action itself is rounded, by up to a part of its size; so is its distance in the terms of a barrier.
     allowance = 1e-6 + 2.0**-52 * np.abs(u) / divisor + 1e-14 * spread / G
-    move = np.clip(u - width * (g / G), low, high) - u
-    return _ratio(np.where(width > 0, np.abs(move) / divisor, 0.0), allowance)
+    move = np.minimum(np.abs(g) / G, np.where(g > 0, below, above) / divisor)
+    return _ratio(np.where(width > 0, move, 0.0), allowance)
 
 
-def reduced_gradient(a: dict, x, u, lam, s) -> tuple[np.ndarray, np.ndarray]:
+def reduced_gradient(t: dict, x, u, lam, s, mu) -> tuple[np.ndarray, np.ndarray]:
     """The derivative dJ/du (count, H, n_u) by an own adjoint recursion, and the sizes of its terms.
 
     With ρ = λ∘y the equation (diag s + Fᵀ diag λ) y = −Cᵀp is (diag s/λ + Fᵀ) ρ = −Cᵀp; rows are scaled by λ/(λ+s).
     """
-    size = {k: np.abs(v) for k, v in a.items()}
-    b = lam / (lam + s)
-    p = mul(a["Q_final"], x[:, -1]) + a["q_final"]
-    steps = []
-    for k in reversed(range(u.shape[1])):
+    t = {"S": np.zeros((1, 1, x.shape[-1], u.shape[-1])), **t}
+    t |= {k: np.zeros((1, 1, 0, v.shape[-1])) for k, v in (("G_x", x), ("G_u", u)) if k not in t}
+    b, horizon, steps = lam / (lam + s), u.shape[1], []
+    p = mul(t["Q_final"][:, 0], x[:, -1]) + t["q_final"][:, 0] + mul(_t(t["G_x"][:, -1]), mu[:, -1])
+    for k in reversed(range(horizon)):
+        a = {name: v[:, min(k, v.shape[1] - 1)] for name, v in t.items()}
         matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (s / (lam + s))[:, k, :, None]
         rho = _solve(matrix, -b[:, k] * mul(_t(a["C"]), p))
-        g = mul(a["R"], u[:, k]) + a["r"] + mul(_t(a["B"]), p) + mul(_t(a["E"]), rho)
-        terms = mul(size["R"], np.abs(u[:, k])) + size["r"]
-        terms = terms + mul(_t(size["B"]), np.abs(p)) + mul(_t(size["E"]), np.abs(rho))
-        steps.append((g, terms))
-        p = mul(a["Q"], x[:, k]) + a["q"] + mul(_t(a["A"]), p) + mul(_t(a["D"]), rho)
+        parts = [(a["R"], u[:, k]), (_t(a["S"]), x[:, k]), (_t(a["B"]), p), (_t(a["E"]), rho), (_t(a["G_u"]), mu[:, k])]
+        sizes = sum((mul(abs(M), abs(v)) for M, v in parts), abs(a["r"]))
+        steps.append((sum((mul(M, v) for M, v in parts), a["r"]), sizes))
+        p = mul(a["Q"], x[:, k]) + a["q"] + mul(a["S"], u[:, k]) + mul(_t(a["A"]), p) + mul(_t(a["D"]), rho)
+        p = p + mul(_t(a["G_x"]), mu[:, k])
     g, terms = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
     return g, terms
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Batched solve; NaN where a matrix is singular or not finite."""
-    vector = right.ndim == 2
-    ok = np.isfinite(matrix).all((1, 2)) & np.isfinite(right).reshape(len(right), -1).all(1)
+    ok = np.isfinite(matrix).all((1, 2)) & np.isfinite(right).all(1)
     safe = torch.from_numpy(np.where(ok[:, None, None], matrix, np.eye(matrix.shape[-1])))
-    out, singular = torch.linalg.solve_ex(safe, torch.from_numpy(right[..., None] if vector else right))
-    out = np.where((ok & (singular.numpy() == 0))[:, None, None], out.numpy(), np.nan)
-    return out[..., 0] if vector else out
+    out, singular = torch.linalg.solve_ex(safe, torch.from_numpy(right[..., None]))
+    return np.where((ok & (singular.numpy() == 0))[:, None], out[..., 0].numpy(), np.nan)
 
 
 def _vertex(problem: Case, u, low, high) -> np.ndarray:
@@ -201,7 +233,7 @@ def judge_relaxed_program(
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):
         ratios = judge_mpc(problem, x, u, lam, objective)
-        s, terms = affine(problem.full(), "DEFc", x[:, :-1], u, lam)
+        s, terms = affine(by_stage(problem), "DEFc", x, u, lam)
         kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
         return {
             **{k: ratios[k] for k in kept},

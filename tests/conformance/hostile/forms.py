@@ -13,14 +13,12 @@ from numpy.random import Generator
 
 from difflcs import Status
 from difflcs.errors import DiffLCSError
-from tests.conformance import judges
 from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.generators import by_name
-from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, quiet, refused_one_by_one
+from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, promised, quiet, refused_one_by_one
 from tests.conformance.varied import programs
 from tests.conformance.varied.generators import random_case
-from tests.conformance.varied.judges import conditions
 
 ROWS = ("G_x", "G_u", "g", "price")
 INF = np.inf
@@ -186,61 +184,20 @@ def _solve(form: Case, warm: bool) -> Outcome:
     return Outcome(status, ratios)
 
 
-# Of every condition of `varied.judges` how much a solution may be off: what the library promises, and as much again
-# for what the own judge measures otherwise.
-LIMITS = {"start": 0.0, "sign": 0.0, "price": 0.0, "bounds": 0.0}
-
-
 def _judge(form: Case, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
-    count, solved = form.count, (status == Status.CONVERGED) | (status == Status.DEGENERATE)
-    found: checks.Ratios = {}
-
-    def put(name: str, i: int, ratio: float) -> None:
-        found.setdefault(name, np.zeros(count))[i] = np.inf if np.isnan(ratio) else ratio
-
-    case = form
+    count, solved, case = form.count, (status == Status.CONVERGED) | (status == Status.DEGENERATE), form
     if "price" in case.arrays:  # from 1e300 on a constraint is hard, see `Constraints`
         price = case.arrays["price"]
         case = case.changed(price=np.where(price >= 1e300, INF, price))
-    for i in range(count):
-        low, high = (np.stack([case.at(k, i, n) for n in range(case.horizon)]) for k in ("u_min", "u_max"))
-        put("bounds", i, 0.0 if ((u[i] >= low) & (u[i] <= high)).all() else np.inf)
-        put("false INFEASIBLE of a convex program", i, 0.0)
-        if status[i] == Status.INFEASIBLE and form.possible[i] and lam.shape[-1] == 0:
-            put("false INFEASIBLE of a convex program", i, np.inf)
-        if not solved[i]:
-            continue
-        if form.impossible[i]:
-            put("solved what is impossible", i, np.inf)
-        try:
-            parts = conditions(case, i, x[i], u[i], lam[i], mu[i])
-        except np.linalg.LinAlgError:
-            continue  # float64 does not hold its products
-        for name, value in parts.items():
-            limit = LIMITS.get(name, 2e-6)
-            put(name, i, value / limit if limit else (0.0 if value <= 0 else np.inf))
-        mine, mine_size, c, size = _cost(case, i, x[i], u[i])
-        put("objective", i, abs(mine - cost[i]) / (1e-8 * (1 + mine_size)))
-        worst = np.maximum(np.where(np.isfinite(c), c, 0.0), 0.0).max(initial=0.0)
-        room = 1e-9 * (1e-9 + np.where(np.isfinite(size), size, 0.0).max(initial=0.0))
-        put("violation", i, abs(worst - violation[i]) / room)
-        if lam.shape[-1] == 0 and (gap := programs.above_optimum(case, i, u[i])) is not None:
-            put("optimum of a linear program", i, gap / 1e-6)
+    judged = checks.judge_mpc(case, x, u, lam, cost, mu, violation)
+    found = {**promised(judged, solved), "bounds": judged["bounds"]}
+    found["solved what is impossible"] = np.where(solved & form.impossible, INF, 0.0)
+    if lam.shape[-1] == 0:
+        wrong = (status == Status.INFEASIBLE) & form.possible
+        found["false INFEASIBLE of a convex program"] = np.where(wrong, INF, 0.0)
+        gaps = [programs.above_optimum(case, i, u[i]) if solved[i] else None for i in range(count)]
+        found["optimum of a linear program"] = np.array([0.0 if gap is None else gap / 1e-6 for gap in gaps])
     return found
-
-
-def _cost(case: Case, i: int, x, u) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """The cost with the price of violations of soft rows, the rows, and the sums of the sizes of the terms of both."""
-    t = case.element(i)
-    given, sizes = (t, x, u), (judges.absolute(t), abs(x), abs(u))
-    total, size = (float(judges.cost(*terms)) for terms in (given, sizes))
-    if "g" not in t:
-        return total, size, np.zeros(0), np.zeros(0)
-    c, terms = judges.rows(*given), judges.rows(*sizes)
-    price, over = np.where(np.isfinite(t["price"]), t["price"], 0.0), np.maximum(c, 0.0)
-    # A price of 1e30 makes 1e14 of the rounding of a row that is held.
-    fines = np.where(np.isfinite(c), price * (over + 1e-6 * terms), 0.0).sum()
-    return total + (price * over).sum(), size + fines, c, terms
 
 
 def form_target(form: Case, rng: Generator, gradients: bool, warm: bool = False) -> Outcome:

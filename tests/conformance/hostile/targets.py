@@ -96,7 +96,7 @@ def _rounding(*pairs: tuple[torch.Tensor, torch.Tensor]) -> np.ndarray:
     return np.where(np.all(same, axis=0), 0.0, np.inf)
 
 
-def _promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
+def promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
     """Conditions hold for solved elements; finite numbers for all."""
     return {k: v if k in ("finite", "finite gradient") else np.where(solved, v, 0.0) for k, v in ratios.items()}
 
@@ -141,7 +141,7 @@ def _lcp(problem: LCP, relaxation: float, dtype) -> Outcome:
     elif not bool(torch.isfinite(F_grad).all()) and not gradient.any():
         gradient = _who(lambda part: part.each(), lambda part: _lcp(part, relaxation, dtype), problem)
     ratios["finite gradient"] = gradient
-    return Outcome(status, _promised(ratios, status == Status.CONVERGED))
+    return Outcome(status, promised(ratios, status == Status.CONVERGED))
 
 
 def _who(each, run, problem) -> np.ndarray:
@@ -266,7 +266,7 @@ def _mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
         gradient = _who(lambda part: part.each(), again, problem)
     ratios["finite gradient"] = gradient
     outcome = Outcome(status, ratios)
-    outcome.ratios = _promised(ratios, outcome.solved)
+    outcome.ratios = promised(ratios, outcome.solved)
     return outcome
 
 
