@@ -7,7 +7,7 @@ task has for models, with the method behind it unless that is the default one. N
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import tyro
 
 from difflcs import zoo
+from difflcs.cli.train import flatten
 from difflcs.errors import CheckpointError, DiffLCSError
 from difflcs.rl import write_atomically
 from difflcs.rl.methods import DEFAULT_METHOD
@@ -93,12 +94,12 @@ def training_command(config: TrainConfig, init: object = None) -> str:
         config: the training.
         init: what the run started from, as config.json holds it.
     """
-    settings, usual = (json.loads(json.dumps(c.to_json())) for c in (config, TrainConfig(method=type(config.method)())))
-    words = ["difflcs", "train"]
-    for name in ("task", "method", "minutes", "seed"):
-        words += _flag(name, settings.pop(name))
-    words += _differences(settings.pop("settings"), usual.pop("settings"))
-    words += _differences(settings, usual)
+    settings, usual = (
+        flatten(json.loads(json.dumps(c.to_json()))) for c in (config, TrainConfig(method=type(config.method)()))
+    )
+    told = {name: settings.pop(name) for name in ("task", "method", "minutes", "seed")}
+    told |= {name: value for name, value in settings.items() if name not in usual or value != usual[name]}
+    words = ["difflcs", "train", *(word for name, value in told.items() for word in _flag(name, value))]
     if init is not None:
         source = Path(str(init))  # of a path the last part only: folders of one machine mean nothing elsewhere
         source = source.parent if source.name == "model" else source
@@ -106,18 +107,8 @@ def training_command(config: TrainConfig, init: object = None) -> str:
     return shlex.join(words)
 
 
-def _differences(settings: Mapping[str, Any], usual: Mapping[str, Any], prefix: str = "") -> list[str]:
-    words: list[str] = []
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            words += _differences(value, usual.get(name, {}), f"{prefix}{name}.")
-        elif name not in usual or value != usual[name]:
-            words += _flag(prefix + name, value)
-    return words
-
-
 def _flag(name: str, value: object) -> list[str]:
-    name = name.replace("_", "-")
+    name = name.removeprefix("settings.").replace("_", "-")
     if isinstance(value, bool):
         group, dot, last = name.rpartition(".")
         return [f"--{name}" if value else f"--{group}{dot}no-{last}"]

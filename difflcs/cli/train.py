@@ -57,7 +57,7 @@ class Train(TrainConfig):
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
-        wanted, before = _flatten(config.to_json()), _flatten(stored.to_json())
+        wanted, before = flatten(config.to_json()), flatten(stored.to_json())
         for name, value in wanted.items():
             flag = name.removeprefix("settings.").replace("_", "-")
             if flag in self.passed and value != before.get(name):
@@ -84,11 +84,11 @@ class Train(TrainConfig):
         return "difflcs" if own else f"python {sys.argv[0]}"
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested settings: dotted name → value."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat
 
 
