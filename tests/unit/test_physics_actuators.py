@@ -215,7 +215,8 @@ def test_a_plan_with_driven_mocap_bodies_knows_how_they_push_and_pull():
     x, u = module.observe(data), torch.tensor([0.04, 0.0, 0.0, 0.01, 0.0, 0.0], dtype=torch.float64)
     before.mocap_pos[:] += u.numpy().reshape(2, 3)
     mujoco.mj_step(jump, before, 25)
-    planned = module.state.to_mujoco(module.params(x).step(x, u).x_next)[0]
+    with pytest.warns(ContactWarning, match="body 'cart'"):  # which hands may miss that go a decimetre
+        planned = module.state.to_mujoco(module.params(x).step(x, u).x_next)[0]
     np.testing.assert_allclose(planned[[3, 7]], before.qpos, atol=1.5e-3)  # of hand, cart, grip, arm
     data.ctrl[:] = module.control(x, 0 * u)
     mujoco.mj_step(driven, data, 25)  # stays, as gravity does not act on it

@@ -16,6 +16,7 @@ from tests.conftest import F64, refuse
 
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
 VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0, "loss": 0.2, "torsion": 0.01}
+pytestmark = pytest.mark.filterwarnings("ignore:expected a system as near")  # with servos a decimetre away
 OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6, "caps": 4}
 
 

@@ -19,6 +19,7 @@ _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 a
 _JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 _JOINTS = _JOINT, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_DECIMETRE = 0.1  # size of an action of a servo on a slide [m]
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _FIXED, _UNBIASED, _AFFINE = (
     int(v) for v in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
@@ -47,10 +48,10 @@ class Actuators:
         follows: (nu,) True if it has no activation, or one that goes to its control.
         activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
-        usual: (nu,) size of actions where there is no range: 1; of a servo on a slide, for a metre, two and a half
+        usual: (nu,) size of actions where there is no range: 1; of a servo on a slide, a decimetre, or two and a half
             times what the joint's limits leave.
         reach: (nu,) size of actions: half of the range, or 1.
-        brakes: (nv,) damping by drives on slides and hinges whose force is limited.
+        brakes: (nv,) damping by drives on slides and hinges whose force is limited, or that of the joint.
         gain, constant, bias, damping: (nu,) of the force: gain · control + constant + bias · length + damping · rate.
         affine: (nu,) True if this is all, where activation has settled.
         straight: (nu,) True if the length is linear in the positions of slides and hinges.
@@ -86,14 +87,15 @@ class Actuators:
         limited = model.jnt_limited[joints].astype(bool)
         width = np.ptp(model.jnt_range[joints], axis=1) * limited
         self._stops = np.where(limited & (self.dof >= 0) & stops, model.jnt_range[joints].T, [[-np.inf], [np.inf]])
-        self.usual = np.where(slides, 2.5 * np.abs(self.gear) * width, 1.0)
+        self.usual = np.where(slides, np.maximum(_DECIMETRE, 2.5 * np.abs(self.gear) * width), 1.0)
         self.reach = np.where(np.isfinite(self.range).all(0), 0.5 * np.ptp(self.range, axis=0), 1.0)
         bends = (model.actuator_gaintype != _FIXED) | (dynamics == _MUSCLE)
         self.curved = np.flatnonzero(bends & (np.ptp(self.range, axis=0) > 0) & np.isfinite(self.range).all(0))
         plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
         self.force = self._force_limits(model, joint)
         self._force = np.where(plain, self.force, [[-np.inf], [np.inf]])
-        brakes = np.where(np.isfinite(self._force).any(0) & (self.dof >= 0), -damping * self.gear**2, 0.0)
+        limited = np.isfinite(self._force).any(0) | model.jnt_actfrclimited[joints].astype(bool)
+        brakes = np.where(limited & (self.dof >= 0), -damping * self.gear**2, 0.0)
         self.brakes = np.bincount(self.dof.clip(0), brakes.clip(0), minlength=model.nv)
         tendon = model.wrap_type[model.tendon_adr] == int(mujoco.mjtWrap.mjWRAP_JOINT)
         of_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)

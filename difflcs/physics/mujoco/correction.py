@@ -197,14 +197,14 @@ def correct(
 
 def warn_of_wrong(
     predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, in_tree: NDArray[Any], model: Any
-) -> bool:
+) -> None:
     """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
     Each tree of bodies counts by itself, as an object may be much lighter than the robot.
 
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
     without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv), and in_tree
-    (nv, n_trees) says which degree of freedom belongs to which tree. Returns whether it warned.
+    (nv, n_trees) says which degree of freedom belongs to which tree.
     """
     mass = np.linalg.inv(inverse_mass)
 
@@ -220,7 +220,7 @@ def warn_of_wrong(
     least = least + _NEARLY * np.nan_to_num(np.median(change, 0))  # near balance any error of large actions shows
     most = change + _FARTHER * moves + least
     held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
-    excess = size(off) - np.where(held, 0.0, most)
+    excess = (size(off) - np.where(held, 0.0, most)) / most
     wrong = np.any(excess > 0, (0, 2))
     if wrong.any():
         *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)
@@ -231,7 +231,7 @@ def warn_of_wrong(
             f"expected a system as near to MuJoCo's own step as standing still is, that moves where MuJoCo does, also "
             f"at the ends of the ranges of its actions and between, got one that is farther off, or holds still, with "
             f"such an action in {wrong.sum()} of {len(wrong)} states, most of all joint {joint.name or joint.id!r} of "
-            f"body {body.name or body.id!r}: take fewer seconds, less friction, or a nominal control near the actions",
+            f"body {body.name or body.id!r}: take fewer seconds, less friction, a nominal control near the actions, "
+            f"or a ctrlrange of the actuators without such actions",
             ContactWarning,
         )
-    return bool(wrong.any())

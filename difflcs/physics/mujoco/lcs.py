@@ -377,13 +377,11 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
         return [v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free)]
 
     u, low, high = _choose_actions(of, x, torch.from_numpy(step.idle[some]), bounds)
-    bodies = step.velocity[some], read.moved.inverse_mass[some], of._motion.in_tree, of._model
-    at, to, alone = tried = compare(u)
-    if warn_of_wrong(at[0], to[0], alone, *bodies):
-        return
+    _, to, alone = tried = compare(u)
     balanced = u + _find_balance(step, some, to[0], alone[0], (high - low).numpy())
     more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
     at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
+    bodies = step.velocity[some], read.moved.inverse_mass[some], of._motion.in_tree, of._model
     warn_of_wrong(at[0], to[0], alone, *bodies)
 
 
@@ -391,15 +389,12 @@ def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tupl
     """Choose actions (m, n, nu) within their bounds at states (n, n_x) with nominal ones; and ends of their ranges."""
     zero, usual = of.control(x, torch.zeros_like(idle)), torch.from_numpy(of._actuators.usual)
     ends = torch.from_numpy(of._actuators.range)[:, None] - zero
-    other = torch.where((usual > 0) | (zero.abs() > 1), -zero, idle)  # of a servo on a slide that is beyond a metre
-    likely = torch.stack([torch.minimum(idle, other) - usual, torch.maximum(idle, other) + usual])
-    forces = torch.stack(bounds)  # which say how far such a servo goes, where a metre has too much force
-    likely = torch.where((usual > 0) | (forces.abs() > 1), likely, forces)
+    likely = torch.stack([torch.minimum(idle, -zero) - usual, torch.maximum(idle, -zero) + usual])
     low, high = ends = torch.where(ends.isfinite(), ends, likely)
     parts = of._parts.clone()
     parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
     turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
-    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, other])]).clamp(*bounds)
+    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, -zero])]).clamp(*bounds)
     return u, low, high
 
 
