@@ -201,7 +201,9 @@ def make_object(
         raise ValueError(f"Expected object_source 'auto', 'mesh' or 'stand_in', got {source!r}. Choose one of them.")
     entry = YCB.get(name)
     if entry is None:
-        return _object_from_file(name, mass, friction, source, rest_pose, parts, mesh_scale)
+        path, kilograms = _mesh_file(name, source), _mass(mass, None)
+        solid = make_solid(load_mesh(path, mesh_scale), path.name, parts, rest_pose)
+        return MeshObject(name=path.stem, source="mesh", solid=solid, mass=kilograms, friction=friction)
     kilograms = _mass(mass, entry.mass)
     path = None if source == "stand_in" else find_ycb_mesh(entry)
     if path is not None:
@@ -222,15 +224,7 @@ def make_object(
     return StandInObject(name=name, ycb=entry, mass=kilograms, friction=friction)
 
 
-def _object_from_file(
-    name: str,
-    mass: float | str | None,
-    friction: float,
-    source: str,
-    rest_pose: str | int,
-    parts: int | None,
-    mesh_scale: float,
-) -> MeshObject:
+def _mesh_file(name: str, source: str) -> Path:
     path = Path(name).expanduser()
     if path.suffix.lower() not in MESH_SUFFIXES and not path.exists():
         raise ValueError(
@@ -240,8 +234,7 @@ def _object_from_file(
         raise ValueError(
             "Expected object_source 'auto' or 'mesh' for a mesh file, got 'stand_in'. Only YCB objects have one."
         )
-    solid = make_solid(load_mesh(path, mesh_scale), path.name, parts, rest_pose)
-    return MeshObject(name=path.stem, source="mesh", solid=solid, mass=_mass(mass, None), friction=friction)
+    return path
 
 
 def _mass(mass: float | str | None, published: float | None) -> float:
