@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from difflcs_envs.checks import checked_array, checked_integer, checked_options
@@ -35,8 +35,9 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
 
     - NEXT_STEP: the next `step` ignores its action and resets it (reward 0). The observation returned at the end of an
       episode is the last one of that episode.
-    - SAME_STEP: it is reset at once. `info["final_obs"]` and `info["final_info"]` hold what the episode ended with.
     - DISABLED: `reset(options={"reset_mask": mask})` must be called before the next `step`.
+
+    With SAME_STEP, `gymnasium.make_vec` gives Gymnasium's own `SyncVectorEnv`, which steps them one by one.
 
     Attributes:
         envs: The single environments. They share one MuJoCo model.
@@ -65,6 +66,8 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         """
         self.num_envs = checked_integer("num_envs", num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            raise ValueError("Expected autoreset_mode NEXT_STEP or DISABLED, got SAME_STEP. Use gymnasium.make_vec.")
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # pyright: ignore[reportAttributeAccessIssue]
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self.threads = cores if threads is None else checked_integer("threads", threads)
@@ -154,8 +157,6 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
             warnings.warn(
                 f"{UNSTABLE} (environments {np.flatnonzero(unstable).tolist()})", PhysicsWarning, stacklevel=2
             )
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
-            infos = self._reset_at_once(infos, truncated)
         return self._observations(), rewards, np.zeros(self.num_envs, dtype=bool), truncated, infos
 
     def render(self) -> tuple[np.ndarray | None, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -219,24 +220,6 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         self._states[i], self._goals[i] = observation["state"], observation["goal"]
         self._steps[i], self._ended[i] = 0, False
 
-    def _reset_at_once(self, infos: dict[str, Any], ended: np.ndarray) -> dict[str, Any]:
-        """Mode SAME_STEP: keep the last observations and infos, and start the next episodes."""
-        last = self._observations()
-        final_obs = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(ended).tolist():
-            final_obs[i] = {name: value[i] for name, value in last.items()}
-        final_info = {name: np.copy(value) for name, value in infos.items()}
-        for name in list(final_info):
-            if name.startswith("_"):
-                final_info[name] = final_info[name] & ended
-        for i in np.flatnonzero(ended).tolist():
-            self._reset_one(i, None, {})
-        infos |= self._masked(self._pose_info(), np.ones(self.num_envs, dtype=bool))
-        for name in final_info:
-            if name.startswith("_") and name[1:] not in ("success", "position_error", "yaw_error"):
-                infos[name] = infos[name] & ~ended
-        return infos | {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
-
     def _observations(self) -> dict[str, np.ndarray]:
         observations = {"state": self._states.copy(), "goal": self._goals.copy()}
         if "time_to_go" in self.single_observation_space.spaces:  # pyright: ignore[reportAttributeAccessIssue]
@@ -268,7 +251,9 @@ def _multiply(
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     threads: int | None = None,
     **arguments: Any,
-) -> TriFingerVectorEnv:
+) -> TriFingerVectorEnv | SyncVectorEnv:
+    if AutoresetMode(autoreset_mode) is AutoresetMode.SAME_STEP:
+        return SyncVectorEnv([functools.partial(env, **arguments)] * num_envs, autoreset_mode=autoreset_mode)
     return TriFingerVectorEnv(env(**arguments), num_envs, autoreset_mode, threads)
 
 
