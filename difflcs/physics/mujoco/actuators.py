@@ -203,24 +203,24 @@ class Actuators:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
         return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
 
-    def even_out(self, ctrl: Array, activation: Array, A: Array, B: Array) -> None:
-        """Give muscles one rate in both directions, that of the nominal control, in their rows of n transitions.
+    def even_out(self, ctrl: Array, activation: Array, rates: Array) -> None:
+        """Give muscles one rate in both directions, that of the nominal control, in their rows of n linearised rates.
 
         Differences have the rate of activation by the control and that of deactivation by the activation.
 
         Args:
             ctrl: (n, nu) nominal controls.
             activation: (n, na) where it is linearised.
-            A: (n, n_x, n_x) transitions by the state.
-            B: (n, n_x, nu) by control.
+            rates: (n, nv + na, n_x + nu) rates of velocities and activation by the state and by control.
         """
         i, at = self._muscles, activation[:, self._muscles]
-        acts, row = self.activated[i], A.shape[1] - len(self._time) + i
+        acts, row = self.activated[i], rates.shape[1] - len(self._time) + i
         (rise, fall), ctrl = self._rates[i].T, ctrl[:, acts]
         middle = 0.5 + 0.75 * (at + ctrl)
         rate = np.where(ctrl >= at, 1 / (rise * middle), middle / fall)
-        A[:, row], B[:, row] = 0.0, 0.0
-        A[:, row, row], B[:, row, acts] = 1 - rate, rate
+        n_x = rates.shape[2] - len(self.dof)
+        rates[:, row] = 0.0
+        rates[:, row, n_x - len(self._time) + i], rates[:, row, n_x + acts] = -rate, rate
 
     def unlimit_rates(self, model: Any) -> None:
         """Let activations of a model change by their rates, however long the step, to whatever value."""

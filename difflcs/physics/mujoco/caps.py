@@ -9,7 +9,6 @@ much again, friction stays as it is, and the contact slides without opening; see
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs._checks import check_positive_int
@@ -17,7 +16,6 @@ from difflcs.physics.complementarity import count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, count_points, find_moving
 from difflcs.physics.mujoco.limits import give_way
 from difflcs.physics.mujoco.readings import Readings
-from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
 _MOST = 1.5  # times the load at the nominal action, up to which friction grows
@@ -80,14 +78,12 @@ class Caps:
         pressed = np.any(joined & steep[:, None], -1)
         return np.where((load > 0) & ~pressed, _MOST * load, caps + _FREE * load)
 
-    def limit_by_forces(self, system: LCSParams, lam: torch.Tensor, read: Readings, response: Array) -> LCSParams:
-        """Set the caps of a system without velocities by its own forces (..., n_lam) at the nominal action."""
+    def limit_by_forces(self, c: Array, lam: Array, read: Readings, response: Array) -> None:
+        """Set the caps in c (..., n_lam) of systems without velocities by their forces lam at the nominal action."""
         if not self.count:
-            return system
+            return
         n, rays = len(read.x), count_forces(len(self._rough), read.dof_contacts.tangent.shape[2])
-        forces = lam.reshape(n, system.n_lam).numpy()
+        forces = lam.reshape(n, lam.shape[-1])
         loads = forces[:, :rays].reshape(n, len(self._rough), -1).sum(-1)
         loads[:, : self.count] += forces[:, rays : rays + self.count]
-        c = system.c.clone()
-        c[..., -self.count :] = torch.from_numpy(read.batched(self.limit(read.dof_contacts, loads, response, 1.0)))
-        return LCSParams.of_checked({"c": c}, like=system)
+        c[..., -self.count :] = read.batched(self.limit(read.dof_contacts, loads, response, 1.0))

@@ -19,16 +19,17 @@ from difflcs.physics.complementarity import Cone, Contacts, count_forces, given_
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
-from difflcs.physics.mujoco.correction import WholeStep, correct, predict, warn_of_wrong
+from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces, predict, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
-from difflcs.physics.mujoco.nominal import Recovery, Situation, find_stiff, loosen
+from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
+from difflcs.physics.mujoco.quasi_static import QuasiStatic
 from difflcs.physics.mujoco.readings import Readings
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
@@ -231,35 +232,35 @@ class MujocoLCS:
         unit, loads = self.length / self._give, None
         if isinstance(self._motion, Dynamic):
             middle = read.moved.middle[:, : self.state.nv]
-            step = self._motion.finish(read.moved, read.x, self._equality.read(read.qpos, middle))
+            step = self._motion.finish(read.moved, read.x, read.tangent, self._equality.read(read.qpos, middle))
             found = self._rows.find(read.qpos, step.place, step.response, middle)
-            soft = self._recovery, self._give, self.compliance, self.cone == "anitescu"
-            at = Situation(step, contacts, rough, found, *soft)
+            more = self._recovery, self._give, self.compliance, self.cone == "anitescu"
+            at = Situation(step, contacts, rough, found, *more)
             overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
             nominal = overlaps.evaluate(at)
-            contacts, rows = nominal.contacts, nominal.rows
+            contacts, soft, rows = nominal.contacts, nominal.soft, nominal.rows
             rest = nominal.rest(rough, self._finder.n_tangents, self.cone, self._caps.count)
             loads, response = nominal.forces[:, rough].sum(-1), step.response
-            free = step.free(read.tangent, nominal.carried)
+            free = step.free(nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
             free = self._equality.hold_positions(free, read.x, read.qpos, read.tangent)
             response = np.broadcast_to(read.to_dofs(free.response), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
-            rows = scale(found, response, self._give)
+            rows, soft = scale(found, response, self._give), np.full_like(contacts.gap, self.compliance)
         caps = self._caps.limit(contacts, loads, response, unit)
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
             contacts = contacts.take(np.s_[:, rough])
-        soft = np.full_like(contacts.gap, self.compliance) if overlaps is None else overlaps.compliance[:, rough]
-        effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
-        soft = soften(rows, found, step, self._give, self.compliance, soft)
+        effect = None if step is None else step.effect(rows.normal, rows.impulse)
+        soft = soften(rows, found, step, self._give, self.compliance, soft[:, rough])
         system = read.assemble(contacts, rows, free, effect, caps, soft, self.cone, self.length, unit, rest)
-        system = self._rest_on_forces(system, read, response) if self.motion == "quasi-dynamic" else system
+        if self.motion == "quasi-dynamic":
+            _rest_on_forces(self, system, read, response)
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = read.tangent, rows.bound / unit, found, hard, read.batched(rest != 0)
+            more = rows.bound / unit, found, hard, read.batched(rest != 0)
             system, read.doubtful[:] = correct(system, step, read.after, *more)
         _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -316,16 +317,6 @@ class MujocoLCS:
         low, high = (torch.from_numpy(v).to(x) for v in bounds)
         return low, high
 
-    def _rest_on_forces(self, system: LCSParams, read: Readings, response: Any) -> LCSParams:
-        """Let contacts give way from their forces at the nominal action on, and set the caps of friction by these."""
-        rough, smooth = int(self._finder.rough.sum()), int((~self._finder.rough).sum()) + self._caps.count
-        more = find_stiff(system, count_forces(rough, self._finder.n_tangents, self.cone, smooth), self.compliance)
-        if not (len(read.x) and (self._caps.count or more.any())):
-            return system
-        x, u = (torch.from_numpy(read.batched(v)) for v in (read.x, read.moved.nominal))
-        lam = predict(system, x, u).lam
-        return self._caps.limit_by_forces(loosen(system, more, lam), lam, read, response)
-
     def _read(self, x: Tensor, context: Tensor | None = None) -> Readings:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
@@ -355,6 +346,20 @@ def _respond(of: MujocoLCS, limits: bool) -> tuple[float, Any]:
     return median_apart(model, data, here[0], response, finder.main_pairs, 3 if finder.axis is None else 2), yields
 
 
+def _rest_on_forces(of: MujocoLCS, system: LCSParams, read: Readings, response: Any) -> None:
+    """Let contacts give way from their forces at the nominal action on, and set the caps of friction by these."""
+    rough, smooth = int(of._finder.rough.sum()), int((~of._finder.rough).sum()) + of._caps.count
+    count = count_forces(rough, of._finder.n_tangents, of.cone, smooth)
+    firm, c = np.einsum("...ii->...i", system.F.numpy())[..., :count], system.c.numpy()
+    least = min(LEAST, 0.5 * of.compliance) * (firm - of.compliance)
+    more = np.maximum(least - of.compliance, 0.0)
+    if len(read.x) and (of._caps.count or more.any()):
+        lam = find_forces(system, read.batched(read.x), read.batched(read.moved.nominal))
+        firm += more
+        c[..., :count] -= more * lam[..., :count]
+        of._caps.limit_by_forces(c, lam, read, response)
+
+
 def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
     """Warn where systems are far off with no control, at the ends of the ranges of actions, between, or in balance."""
     before, of._asked = of._asked, of._asked + len(read.x)
@@ -373,7 +378,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
         states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
         after = whole.simulate(of._places, states, ctrl)
         free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
-        predicted = predict(LCSParams.of_checked(flat), each, u).x_next.numpy()
+        predicted, _ = predict(LCSParams.of_checked(flat), each.numpy(), u.numpy())
         return [v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free)]
 
     u, low, high = _choose_actions(of, x, torch.from_numpy(step.idle[some]), bounds)

@@ -1,6 +1,6 @@
-"""Motion of a MuJoCo model in one step without contact: quasi-static, or with velocities.
+"""Motion of a MuJoCo model with velocities in one step without contact.
 
-With velocities, MuJoCo simulates what a nominal control ū does from the state, and its acceleration is linearised half
+MuJoCo simulates what a nominal control ū does from the state, and its acceleration is linearised half
 way there, with ζ the change of position and ν the velocity:
 
     ν̇ = a + K ζ + D (ν − ν̄) + B (u − ū),    ζ̇ = ν.
@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs._checks import check_positive_int
-from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
@@ -49,81 +48,6 @@ _HINGE, _FAR = int(mujoco.mjtJoint.mjJNT_HINGE), 0.5  # turn of it in a step [ra
 _DIFFERENCE = 1e-6, 1e-4  # in parts of the size of actions; with equality constraints, which are solved less exactly
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
-
-
-class QuasiStatic:
-    """Joints with actuators go where they are told; all else moves only while pushed, by its mobility times the force.
-
-    Args:
-        model: a private copy.
-        actuators: of the model.
-        mobility: "inertia": the inverse of the mass matrix; "damping": of the joints' damping; or what a unit of force
-            on each degree of freedom does, (nv,) or (nv, nv).
-    """
-
-    def __init__(self, model: Any, actuators: Actuators, mobility: str | Array):
-        if not model.nu:
-            raise InvalidInputError(
-                'model: expected actuators on what is moved, got none; add <position joint="..."/> for each joint'
-            )
-        others = [i for i, dof in enumerate(actuators.dof) if dof < 0 or (actuators.dof == dof).sum() > 1]
-        if others:
-            raise InvalidInputError(
-                "model: expected each actuator on a slide or hinge of its own for quasi-static motion, got others "
-                f'(numbers {others}); change them, or use motion="quasi-dynamic" or "dynamic"'
-            )
-        self.model = model
-        self.pushed = np.setdiff1d(np.arange(model.nv), actuators.dof)
-        self.B = np.zeros((model.nv, model.nu))
-        self.B[actuators.dof, np.arange(model.nu)] = 1.0
-        self.mobility = None if isinstance(mobility, str) and mobility == "inertia" else self._fixed(mobility)
-        self._native = actuators.describe(model)
-
-    def _fixed(self, mobility: str | Array) -> Array:
-        nv = self.model.nv
-        fixed = np.zeros(nv) if isinstance(mobility, str) else mobility
-        if isinstance(mobility, str):
-            damping = self.model.dof_damping[self.pushed]
-            if (damping <= 0).any():
-                raise InvalidInputError(
-                    'mobility: expected damping above 0 of all joints that are pushed with "damping", got '
-                    f'{float(damping.min()):g}; set it in the model, use "inertia", or give the mobility'
-                )
-            fixed[self.pushed] = 1 / damping
-        fixed = np.diag(fixed) if fixed.ndim == 1 else fixed
-        if fixed.shape != (nv, nv) or not np.isfinite(fixed).all():
-            raise InvalidInputError(
-                f"mobility: expected finite numbers ({nv},) or ({nv}, {nv}), got {fixed.shape}; one for each degree of "
-                f"freedom"
-            )
-        return fixed
-
-    def read(self, places: Places, states: Array, ctrl: Array) -> Array:
-        """Read the inverse mass matrices (n, nv, nv) at states (n, nq + nv + na); the controls (n, nu) do not matter.
-
-        Raises:
-            InvalidInputError: MuJoCo raised an error, or has counted a warning.
-        """
-        n, nv, none = len(states), self.model.nv, np.zeros(0)
-        inverse_mass = np.zeros((n, nv, nv))
-        if self.mobility is None:
-            taken = library(), self._native, places.take(n), states, np.ascontiguousarray(ctrl), inverse_mass
-            places.check(_mujoco.read_rest(*taken, *[none] * 5), n)
-        return inverse_mass
-
-    def finish(self, arrays: Array, x: Array, tangent: Array | None) -> FreeMotion:
-        """Return the motion at states x (n, nv), for the tangent of their rotations."""
-        (n, nv), response = x.shape, self.mobility
-        if response is None:
-            block = np.ix_(np.arange(n), self.pushed, self.pushed)
-            response = np.zeros((n, nv, nv))
-            # What the servos hold does not give way, so the mass matrix counts without their rows.
-            response[block] = np.linalg.inv(np.linalg.inv(arrays)[block])
-        if tangent is not None:
-            inverse = np.linalg.inv(tangent)
-            response = inverse @ response @ inverse.swapaxes(-1, -2)
-        matrices: Any = np.eye(nv), self.B.copy(), np.zeros(nv), response
-        return FreeMotion(*matrices)
 
 
 class Dynamic:
@@ -187,25 +111,31 @@ class Dynamic:
         Where a joint turns far in a step, what is linear half way says little, and differences of the simulation stand
         for all actuators. The states are those of MuJoCo and of the system, (n, n_x).
         """
-        nv, curved = self.model.nv, self.actuators.curved
-        ctrl, hinges = read.nominal + x[:, :nv] @ self.moment.T, self.model.jnt_type[self.model.dof_jntid] == _HINGE
+        nv, nu, curved = self.model.nv, self.model.nu, self.actuators.curved
+        hinges = self.model.jnt_type[self.model.dof_jntid] == _HINGE
         fast = (self.seconds * np.abs(x[:, nv : 2 * nv][:, hinges]) > _FAR).any(-1) & ~read.unstable
-        those = range(self.model.nu) if fast.any() else curved
-        secants = np.full((*read.reached.shape, self.model.nu * (len(those) > 0)), np.inf)
-        for i in those:
-            some = np.full_like(fast, True) if i in curved else fast
-            low, high = self.actuators.range[:, i, None] - ctrl[some, i]
-            size = _DIFFERENCE[bool(self.model.neq)] * self.actuators.reach[i]
-            near = np.where(high > -low, np.minimum(high, size), np.maximum(low, -size))
-            ends = np.stack([0.5 * low, 0.5 * high, low, high] if i in curved else [near])
-            secants[some, :, i] = 0.0
-            for end in ends:
-                other = ctrl[some]
-                other[:, i] += end
-                taken, steps = (places, states[some], other), self._native(self.simulated)
-                after = self.simulate(*taken, read.unstable[some]) if i in curved else self.run(steps, *taken)
-                with np.errstate(over="ignore", invalid="ignore"):
-                    secants[some, :, i] += (after - read.reached[some]) * (end / (ends**2).sum(0))[:, None]
+        if not (fast.any() or curved.size):
+            return read
+        ctrl, bends = read.nominal + x[:, :nv] @ self.moment.T, np.isin(np.arange(nu), curved)
+        low, high = self.actuators.range[:, None] - ctrl
+        size = _DIFFERENCE[bool(self.model.neq)] * self.actuators.reach
+        near = np.where(high > -low, np.minimum(high, size), np.maximum(low, -size))
+        ends = np.zeros((4, len(x), nu))
+        ends[:, :, curved] = np.stack([low, high, 0.5 * low, 0.5 * high])[:, :, curved]
+        ends[0] += near * (fast[:, None] & ~bends)
+        secants = np.repeat(np.where(ends.any(0), 0.0, np.inf)[:, None], x.shape[1], 1)
+        weights = ends / np.maximum((ends**2).sum(0), 1e-300)
+        for kind in (bends, ~bends):
+            _, state, i = those = np.nonzero(ends * kind)
+            if not i.size:
+                continue
+            other = ctrl[state]
+            other[np.arange(len(i)), i] += ends[those]
+            taken, steps = (places, states[state], other), self._native(self.simulated)
+            after = self.simulate(*taken, read.unstable[state]) if bends[i[0]] else self.run(steps, *taken)
+            with np.errstate(over="ignore", invalid="ignore"):
+                change = (after - read.reached[state]) * weights[those][:, None]
+            np.add.at(secants.swapaxes(1, 2), (state, i), change)
         return read._replace(secant=secants)
 
     def simulate(
@@ -234,27 +164,27 @@ class Dynamic:
         """Read it by the steps that are `described`, stable or not."""
         n, nv, nu = len(states), self.model.nv, self.model.nu
         n_x = 2 * nv + self.model.na
-        sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
+        sizes = ((n_x,), (n_x - nv,), (n_x - nv, n_x + nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
         places.check(_mujoco.read_motion(library(), described, places.take(n), states, ctrl, *arrays), n)
         read = Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
         activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
-        self.actuators.even_out(read.nominal, activation, read.A, read.B)
+        self.actuators.even_out(read.nominal, activation, read.rates)
         return read
 
     def find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
         nv, h = self.model.nv, self.seconds / self.simulated.count
         if self.simulated.integrator == _DISCRETE:
-            return np.zeros(len(read.A), dtype=bool)
+            return np.zeros(len(read.rates), dtype=bool)
         inverse_mass, brakes = read.inverse_mass, self.actuators.brakes
-        stiff, damped = read.A[:, nv : 2 * nv, :nv], read.A[:, nv : 2 * nv, nv : 2 * nv] - np.eye(nv)
-        # Drives at a limit of their force, which overshoot without growing, have no derivative.
-        both = [(stiff, damped), (0 * stiff, -inverse_mass * brakes)][: 1 + brakes.any()]
+        both = [(read.rates[:, :nv, :nv], read.rates[:, :nv, nv : 2 * nv])]
+        if brakes.any():  # drives at a limit of their force, which overshoot without growing, have no derivative
+            both += [(np.zeros_like(inverse_mass), -inverse_mass * brakes)]
         # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
         g = _GROWS ** (1 / self.simulated.count)
         most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
-        unstable = np.zeros(len(read.A), dtype=bool)
+        unstable = np.zeros(len(read.rates), dtype=bool)
         for stiff, damped in both:
             rates = h * damped + 0.5 * h * h * stiff
             if self.simulated.integrator != _RK4:
@@ -294,13 +224,13 @@ class Dynamic:
         self.actuators.unlimit_rates(model)
         return model
 
-    def finish(self, read: Linearised, x: Array, equality: Any = None) -> DynamicStep:
-        """Return the motion at states x (n, n_x), with soft equality constraints, `EqualityRows`."""
+    def finish(self, read: Linearised, x: Array, tangent: Array | None, equality: Any = None) -> DynamicStep:
+        """Return the motion at states x (n, n_x), for the tangent of their rotations, with soft `EqualityRows`."""
         nv, h, n_x = self.model.nv, self.seconds, x.shape[1]
-        velocity = x[:, nv : 2 * nv]
-        rates, B = read.A[:, nv:] - np.eye(n_x)[nv:], read.B[:, nv:]
+        velocity, forces = x[:, nv : 2 * nv], np.concatenate([read.rates, read.acceleration[:, :, None]], -1)
         inverse_mass, factor = read.inverse_mass, factor_inverse(read.inverse_mass)
-        mass = (of_mass := np.linalg.inv(factor)).swapaxes(-1, -2) @ of_mass
+        back: Any = np.linalg.inv(factor)
+        mass = back.swapaxes(-1, -2) @ back
         heavier, drag = mass, np.zeros_like(mass)
         if equality is not None:  # the rates have them
             more = equality.force @ equality.normal
@@ -309,37 +239,42 @@ class Dynamic:
             factor = np.linalg.solve(held_by, factor.swapaxes(-1, -2)).swapaxes(-1, -2)
             inverse_mass = factor @ factor.swapaxes(-1, -2)
             drag = equality.force @ (equality.damping[:, :, None] * equality.normal)
-            rates[:, :nv, :nv] -= equality.push(rates[:, :nv, :nv], factor)
+            back = np.linalg.inv(factor)
+            forces[:, :nv, :nv] -= equality.push(forces[:, :nv, :nv], factor)
         # With ν = 0, ζ = 0 and u = ū.
-        load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
-        forces = np.concatenate([rates, B, load[:, :, None]], -1)
-        slow = -heavier @ rates[:, :nv, nv : 2 * nv] - drag
+        forces[:, :, -1:] -= forces[:, :, :n_x] @ read.middle[:, :, None]
+        slow = -heavier @ forces[:, :nv, nv : 2 * nv] - drag
         damping = np.diag(self.damping) if self.steps.integrator == _EULER else slow
-        response = implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+        response = implicit_response(factor, back, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         held = heavier if self.steps.integrator == _DISCRETE else mass
-        step = self._steps(held, forces, damping, self.steps, factor)
+        bodies = factor, back
+        step = self._steps(held, forces, damping, self.steps, *bodies)
         implicit = self._implicit(response @ heavier, forces)
-        step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
+        far = ~(np.abs(step).max((1, 2)) < _BEYOND)
+        step[far] = implicit[far]
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        simulated = step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated, factor)
+        simulated = (
+            step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated, *bodies)
+        )
         if (some := read.unstable).any():
-            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, factor)
+            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, *bodies)
         curved = np.arange(read.secant.shape[2]) + n_x
         more = (read.reached - _reached(simulated, velocity))[:, :, None]
         more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
-        tangent = step[:, :, curved]
+        linear = step[:, :, curved]
         step[:, :, [*curved, -1]] += more
-        kept = (tangent * step[:, :, curved]).sum(1) / np.maximum((tangent * tangent).sum(1), 1e-300)
+        kept = (linear * step[:, :, curved]).sum(1) / np.maximum((linear * linear).sum(1), 1e-300)
         implicit[:, :, curved] *= np.clip(kept, 0.0, 1.0)[:, None]
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
-        return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal)
+        turn = None if tangent is None else _find_turn(tangent)
+        return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal, turn)
 
-    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps, factor: Array) -> Array:
+    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps, factor: Array, back: Array) -> Array:
         """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
 
-        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of M⁻¹, of the mass.
+        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of M⁻¹, of the mass, `back` its inverse.
         """
         n, of, nv = len(forces), forces.shape[2], self.model.nv
         n_x = nv + forces.shape[1]
@@ -355,7 +290,7 @@ class Dynamic:
             rates, one[:] = forces[:, :nv].copy(), np.eye(of)
             if steps.integrator == _DISCRETE:  # at the position after the step
                 rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
-                response = implicit_response(factor, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
+                response = implicit_response(factor, back, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
                 turns = h * h * mass @ forces[:, :nv, :nv]  # of stiff forces that turn with the bodies, a part is skew
                 response = np.linalg.solve(np.eye(nv) + 0.5 * response @ (turns.swapaxes(-1, -2) - turns), response)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
@@ -398,8 +333,7 @@ class Linearised(NamedTuple):
         middle: (n, n_x) where the nominal control leads in half a step, as ζ, ν and the change of the activation na;
             all is linearised there.
         acceleration: (n, nv + na) rates of velocities and activation with the nominal control.
-        A: (n, n_x, n_x) transition by position, velocity and activation in one second of Euler's method.
-        B: (n, n_x, nu) by control.
+        rates: (n, nv + na, n_x + nu) of velocities and activation, by position, velocity, activation and control.
         inverse_mass: (n, nv, nv).
         nominal: (n, nu) action at which this is.
         reached: (n, n_x) where the nominal control leads in a step.
@@ -409,8 +343,7 @@ class Linearised(NamedTuple):
 
     middle: Array
     acceleration: Array
-    A: Array
-    B: Array
+    rates: Array
     inverse_mass: Array
     nominal: Array
     reached: Array
@@ -430,6 +363,7 @@ class DynamicStep(NamedTuple):
         inverse_mass: (n, nv, nv).
         place: (n, nv) ζ afterwards with the nominal action.
         idle: (n, nu) the nominal action.
+        turn: numbers (k,) of what has turned, its block (n, k, k) of T in ζ = T (r − r̄), that of T⁻¹; None: nothing.
     """
 
     motion: Dynamic
@@ -440,6 +374,7 @@ class DynamicStep(NamedTuple):
     inverse_mass: Array
     place: Array
     idle: Array
+    turn: tuple[Any, Any, Any] | None
 
     @property
     def seconds(self) -> float:
@@ -452,40 +387,50 @@ class DynamicStep(NamedTuple):
         nv = self.place.shape[1]
         return self.x[:, nv : 2 * nv]
 
-    def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
-        """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""
+    def turn_back(self, change: Array) -> Array:
+        """Convert changes of ζ (n, nv or more, k) to those of the state's positions, in place."""
+        if self.turn is not None:
+            those, _, back = self.turn
+            change[:, those] = back @ change[:, those]
+        return change
+
+    def free(self, carried: Array) -> FreeMotion:
+        """Motion without contact, with `carried` added to (ζ, ν)."""
         motion, x, step = self.motion, self.x, self.step.copy()
-        (n, n_x), nv, h = x.shape, motion.model.nv, motion.seconds
-        if carried is not None:
-            step[:, : 2 * nv] += carried
+        (n, n_x), nv, turned = x.shape, motion.model.nv, self.response
+        step[:, : 2 * nv] += carried
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
         control = step[:, :, n_x:-1]
-        step[:, :, :nv] += control @ motion.moment
-        step[:, :, -1] -= np.einsum("nij,nj->ni", control, self.idle)
-        response, turned = np.zeros((n, n_x, n_x)), self.response
-        place = h * turned
-        if tangent is not None:  # ζ = T (r − r̄)
-            inverse = np.linalg.inv(tangent)
-            step[:, :nv] = inverse @ step[:, :nv]
-            step[:, :, :nv] = step[:, :, :nv] @ tangent
-            turned = turned @ inverse.swapaxes(-1, -2)
-            place = h * inverse @ turned
+        if motion.relative.size:
+            step[:, :, :nv] += control @ motion.moment
+        step[:, :, -1:] -= control @ self.idle[:, :, None]
+        self.turn_back(step)
+        if self.turn is not None:
+            those, tangent, back = self.turn
+            step[:, :, those], turned = step[:, :, those] @ tangent, turned.copy()
+            turned[:, :, those] = turned[:, :, those] @ back.swapaxes(-1, -2)
         at = x.copy()
         at[:, nv : 2 * nv] = 0.0
-        A_x = np.ascontiguousarray(step[:, :, :n_x])
-        d = at - np.einsum("nij,nj->ni", A_x, at) + step[:, :, -1]
-        response[:, :nv, :nv], response[:, nv : 2 * nv, :nv] = place, turned
+        A_x, response = np.ascontiguousarray(step[:, :, :n_x]), np.zeros((n, n_x, n_x))
+        d = at + (step[:, :, -1:] - A_x @ at[:, :, None])[:, :, 0]
+        response[:, :nv, :nv], response[:, nv : 2 * nv, :nv] = self.turn_back(motion.seconds * turned), turned
         matrices: Any = A_x, np.ascontiguousarray(control), d, response
         return FreeMotion(*matrices)
 
-    def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
+    def effect(self, normal: Array, impulse: Array) -> Array:
         """Compute what forces add to the next state (n, n_x, k): ζ gets h S `normal` (n, k, nv), ν S `impulse`."""
-        h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
-        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
+        (n, n_x), nv = self.x.shape, self.place.shape[1]
+        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (self.seconds * normal, impulse))
         still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
-        if tangent is not None:
-            place = np.linalg.solve(tangent, place).astype(np.float64)
-        return np.concatenate([place, velocity, still], 1)
+        return np.concatenate([self.turn_back(place), velocity, still], 1)
+
+
+def _find_turn(tangent: Array) -> tuple[Any, Any, Any]:
+    """Find the block of T (n, nv, nv) that is not that of the identity, see `DynamicStep.turn`."""
+    differs: Any = np.any(tangent != np.eye(tangent.shape[1]), 0)
+    those = np.flatnonzero(differs.any(0) | differs.any(1))
+    block = tangent[:, those[:, None], those]
+    return those, block, np.linalg.inv(block)
 
 
 def _reached(step: Array, velocity: Array) -> Array:

@@ -146,13 +146,13 @@ def factor_inverse(inverse_mass: Array) -> Array:
         ) from None
 
 
-def implicit_response(factor: Array, K: Array, D: Array, h: float) -> Array:
+def implicit_response(factor: Array, back: Array, K: Array, D: Array, h: float) -> Array:
     """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly.
 
-    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, as M itself has lost the lightest bodies to rounding where some are
-    10¹⁰ times as heavy.
+    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, `back` its inverse, as M itself has lost the lightest bodies to
+    rounding where some are 10¹⁰ times as heavy.
     """
-    scaled = -h * np.linalg.solve(factor, (D + h * K) @ factor)
+    scaled = back @ (-h * (D + h * K)) @ factor
     size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
     directions = factor @ directions
     return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)

@@ -18,21 +18,18 @@ import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from difflcs.errors import ContactWarning, warn
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
-from difflcs.physics.mujoco.limits import Rows, ScaledRows, give_way
+from difflcs.physics.mujoco.limits import Rows, ScaledRows
 from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.native import least_time
-from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
 _USUAL = 0.02  # depth of contacts in parts of the length, under any load
-_LEAST = 0.01  # compliance of a contact in parts of how far its own forces move it; MuJoCo's is .05 and more
-_SOFTER = 0.03  # of the compliance: how exactly forces are computed
+LEAST = 0.01  # compliance of a contact in parts of how far its own forces move it; MuJoCo's is .05 and more
 
 
 class Nominal(NamedTuple):
@@ -40,6 +37,7 @@ class Nominal(NamedTuple):
 
     Attributes:
         contacts: gaps without the depth that the load makes and with what a slide would open; tangents along the slide.
+        soft: (n, n_contacts) compliance of contacts, in parts of `give`; at least LEAST of their own.
         forces: (n, n_contacts, n_rays) of the extreme rays of Anitescu's cone, in the order of `contact_lcs` [N s].
         rows: limits and dry friction.
         row_forces: (n, n_rows) of these.
@@ -47,6 +45,7 @@ class Nominal(NamedTuple):
     """
 
     contacts: MujocoContacts
+    soft: Array
     forces: Array
     rows: ScaledRows
     row_forces: Array
@@ -116,18 +115,6 @@ class Situation(NamedTuple):
     compliance: float
     opens: bool
 
-    @property
-    def soft(self) -> Array:
-        """Compliance (n, n_contacts) of each contact of the system, in parts of `give`, with _LEAST of its own.
-
-        A contact that is far stiffer than what it moves, as those of light links are, makes plans creep.
-        """
-        response, (_, normal, tangent) = self.step.seconds * self.step.response, self.contacts[:3]
-        own = give_way(normal, response)
-        if tangent.shape[2]:  # along the rays of its cone
-            own = own + self.contacts.friction**2 * give_way(tangent, response[:, None]).max(-1)
-        return np.maximum(self.compliance, _LEAST * own / self.give)
-
 
 def solve_forces(
     F: Array, q: Array, low: Array, high: Array, start: Array, compliance: float = 0.0
@@ -146,20 +133,6 @@ def solve_forces(
     return lam, found | (not q.size)
 
 
-def find_stiff(system: LCSParams, count: int, compliance: float) -> Tensor:
-    """Find how much compliance (..., count) the first forces of a system lack to have _LEAST, or half, of their own."""
-    firm = system.F.diagonal(dim1=-2, dim2=-1)[..., :count]
-    return (min(_LEAST, 0.5 * compliance) * (firm - compliance) - compliance).clamp(min=0.0)
-
-
-def loosen(system: LCSParams, more: Tensor, lam: Tensor) -> LCSParams:
-    """Add a compliance (..., count) to the first forces, which counts from the forces lam (..., n_lam)."""
-    F, c, count = system.F.clone(), system.c.clone(), more.shape[-1]
-    F.diagonal(dim1=-2, dim2=-1)[..., :count] += more
-    c[..., :count] -= more * lam[..., :count]
-    return LCSParams.of_checked({"F": F, "c": c}, like=system)
-
-
 def evaluate_nominal(at: Situation) -> Nominal:
     """Decide which contacts close, hold or slide at the nominal action, and which rows act.
 
@@ -170,7 +143,7 @@ def evaluate_nominal(at: Situation) -> Nominal:
     """
     step, contacts, rows, recovery = at.step, at.contacts, at.rows, at.recovery
     (n, k, t, nv), r, motion = contacts.tangent.shape, rows.gap.shape[1], step.motion
-    given = contacts._asdict() | {"row_gap": rows.gap, "row_normal": rows.normal, "bend": rows.bend, "soft": at.soft}
+    given = contacts._asdict() | {"row_gap": rows.gap, "row_normal": rows.normal, "bend": rows.bend}
     given |= {name: getattr(rows.soft, name) for name in ("stiffness", "damping", "impedance")}
     given |= {"row_give": rows.soft.give, "most": rows.soft.bound, "rough": at.rough, "firm": motion.firm}
     given |= {name: getattr(step, name) for name in ("x", "step", "delayed", "response", "inverse_mass")}
@@ -178,9 +151,9 @@ def evaluate_nominal(at: Situation) -> Nominal:
     given |= {"tree": motion.tree.astype(np.int64), "reach": motion.actuators.reach}
     given = {name: np.ascontiguousarray(v) for name, v in given.items()}
     given |= {"bounded": rows.n_friction, "steps": motion.steps.count, "seconds": step.seconds, "opens": at.opens}
-    given |= {"give": at.give, "compliance": _SOFTER * at.compliance, "usual": recovery.usual}
+    given |= {"give": at.give, "compliance": at.compliance, "least": LEAST, "usual": recovery.usual}
     sizes = {"gap": (r,), "normal": (r, nv), "impulse": (r, nv), "bound": (rows.n_friction,), "unit": (r,)}
-    sizes |= {"opened": (k,), "turned": (k, t, nv), "forces": (k, max(1, 2 * t)), "row_forces": (r,)}
+    sizes |= {"soft": (k,), "opened": (k,), "turned": (k, t, nv), "forces": (k, max(1, 2 * t)), "row_forces": (r,)}
     found = {name: np.zeros((n, *size)) for name, size in sizes.items()} | {"carried": np.zeros_like(step.delayed)}
     if missed := _mujoco.evaluate_nominal(max(1, min(n, torch.get_num_threads())), given, found):
         warn(
@@ -191,4 +164,4 @@ def evaluate_nominal(at: Situation) -> Nominal:
         )
     contacts = contacts._replace(gap=found["opened"], tangent=found["turned"])
     scaled = ScaledRows(*(found[name] for name in ScaledRows._fields))
-    return Nominal(contacts, found["forces"], scaled, found["row_forces"], found["carried"])
+    return Nominal(contacts, found["soft"], found["forces"], scaled, found["row_forces"], found["carried"])

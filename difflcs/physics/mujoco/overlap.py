@@ -28,7 +28,7 @@ class Overlaps(NamedTuple):
     Attributes:
         soft: (n, n_contacts) True for those that are soft.
         gap: (n, n_contacts) from which the rays of soft contacts count [m].
-        compliance: (n, n_contacts) of all contacts, in parts of how far they give way.
+        compliance: (n, n_contacts) of soft contacts, in parts of how far they give way.
     """
 
     soft: NDArray[np.bool_]
@@ -46,7 +46,8 @@ class Overlaps(NamedTuple):
         nominal = evaluate_nominal(at._replace(contacts=at.contacts._replace(normal=normal * hard)))
         gap = np.where(self.soft, self.gap, nominal.contacts.gap)
         contacts = nominal.contacts._replace(gap=gap, normal=normal)
-        return nominal._replace(contacts=contacts, forces=nominal.forces * hard)
+        soft = np.where(self.soft, self.compliance, nominal.soft)
+        return nominal._replace(contacts=contacts, soft=soft, forces=nominal.forces * hard)
 
 
 def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps:
@@ -88,4 +89,4 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
     compliance = np.clip(2 * contacts.friction**2 / np.maximum(at.give * firm, 1e-99), _LEAST, _MOST)
     rays = count_forces(1, contacts.tangent.shape[2]) if at.opens else 1
     gap = -at.give * compliance * at.step.seconds * force / rays
-    return Overlaps(soft, gap, np.where(soft, compliance, at.soft))
+    return Overlaps(soft, gap, compliance)

@@ -70,12 +70,12 @@ class Readings(NamedTuple):
             sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
             found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
             threads = max(1, min(n, torch.get_num_threads()))
-            definite = _mujoco.assemble(threads, complementarity.DRAG, length, force, given, found)
+            sure = _mujoco.assemble(threads, complementarity.DRAG, length, force, given, found)
             found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
         else:
-            found, definite = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
-        check_finite(found)
-        if not definite:
+            found, sure = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
+        if not sure:
+            check_finite(found)
             check_positive_definite(found["F"])
         own = {name: v for name, v in found.items() if v.ndim > len(SYSTEM[name])}  # others are shared
         return LCSParams.of_checked(found | {name: self.batched(v) for name, v in own.items()})

@@ -102,7 +102,7 @@ class Servos:
             return change[:, :nv] @ rows.T
 
         each = np.broadcast_to(rows, (n, *rows.shape))
-        effect = free.response @ rows.T if step is None else step.effect(read.tangent, *2 * [of_step * each])
+        effect = free.response @ rows.T if step is None else step.effect(*2 * [of_step * each])
         gives = (rows * effect[:, :nv].swapaxes(-1, -2)).sum(-1)
         gives = np.where(moves := gives > 0, gives, 1.0)  # equality constraints may hold it wholly
         alone = self._seconds**2 * ((rows @ moved.inverse_mass) * rows).sum(-1)

@@ -40,7 +40,7 @@ inline bool is_positive(double* M, int n, double shift) {
   return true;
 }
 
-// Writes the matrices of a state, zero before; false where only their numbers can say whether F + Fᵀ is positive definite.
+// Writes the matrices of a state, zero before; false where only their numbers can say that all are finite, F + Fᵀ positive definite.
 DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
   const int nv = s.nv, nx = s.nx, rays = s.contacts * s.each(), m = s.rows(), all = s.forces(), first = m - s.bounded;
   std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), along(nv), effect(nx), transposed(nv * nx);
@@ -116,7 +116,12 @@ DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const
   for (int v = 0; v < nv; v++)
     for (int w = 0; w < nv; w++) transposed[v * nv + w] = 0.5 * (g.response[v * nx + w] + g.response[w * nx + v]);
   const double off = kRounding * (trace * size * s.force + m * largest);
-  return softest > 2 * off && is_positive(transposed.data(), nv, kRounding * trace);
+  double squares = 0;
+  for (const auto& [numbers, count] :
+       {std::pair<const double*, int>{g.A, nx * nx}, {g.B, nx * s.nu}, {into.C, nx * all}, {into.d, nx},
+        {into.D, all * nx}, {into.E, all * s.nu}, {into.F, all * all}, {into.c, all}})
+    squares += dot(numbers, numbers, count);
+  return std::isfinite(squares) && softest > 2 * off && is_positive(transposed.data(), nv, kRounding * trace);
 }
 
 }  // namespace difflcs::physics

@@ -215,19 +215,19 @@ Outcome find_contacts(const Library& library, const Scene& scene, const std::vec
 // Reads the motion at states (n, nq + nv + na) with nominal controls ctrl (n, nu).
 Outcome read_motion(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
                     Array<const double> state, Array<const double> ctrl, Array<double> middle,
-                    Array<double> acceleration, Array<double> A, Array<double> B, Array<double> inverse_mass,
+                    Array<double> acceleration, Array<double> rates, Array<double> inverse_mass,
                     Array<double> nominal, Array<double> reached) {
   const size_t n = state.shape(0), nv = motion.nv, na = motion.na, nu = motion.nu, size = motion.size();
   check(state.size() == n * (motion.nq + nv + na) && ctrl.size() == n * nu && middle.size() == n * size &&
-        acceleration.size() == n * (nv + na) && A.size() == n * size * size && B.size() == n * size * nu &&
+        acceleration.size() == n * (nv + na) && rates.size() == n * (nv + na) * (size + nu) &&
         inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
         !places.empty());
   const size_t each = motion.nq + 2 * nv + na + nu;
   std::vector<double> memory(places.size() * each);
   return at_places(library, places, n, [&](size_t p, int64_t i) {
-    const Linearised into{middle.data() + i * size, acceleration.data() + i * (nv + na), A.data() + i * size * size,
-                          B.data() + i * size * nu, inverse_mass.data() + i * nv * nv,   nominal.data() + i * nu,
-                          reached.data() + i * size};
+    const Linearised into{middle.data() + i * size,          acceleration.data() + i * (nv + na),
+                          rates.data() + i * (nv + na) * (size + nu), inverse_mass.data() + i * nv * nv,
+                          nominal.data() + i * nu,           reached.data() + i * size};
     Reader(library, motion, *places[p])
         .read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into, &memory[p * each]);
   });
@@ -334,7 +334,7 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
   c.steps = value<int>(f, "steps");
   c.opens = value<bool>(f, "opens");
   for (auto [name, into] : {std::pair{"seconds", &c.seconds}, {"give", &c.give}, {"compliance", &c.compliance},
-                            {"usual", &c.usual}})
+                            {"least", &c.least}, {"usual", &c.usual}})
     *into = value<double>(f, name);
   check(size("rough", 0) == c.contacts && size("firm", 0) == c.nv && size("tree", 0) == c.nv &&
         size("reach", 0) == c.columns - 1 - c.nx);
@@ -348,7 +348,7 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
   std::vector<Acting> given(n);
   bind<const double, Acting>(
       f, {{"gap", &Acting::gap, k}, {"normal", &Acting::normal, k * nv}, {"tangent", &Acting::tangent, k * t * nv},
-          {"friction", &Acting::friction, k}, {"soft", &Acting::soft, k}, {"row_gap", &Acting::row_gap, r},
+          {"friction", &Acting::friction, k}, {"row_gap", &Acting::row_gap, r},
           {"row_normal", &Acting::row_normal, r * nv}, {"bend", &Acting::bend, r},
           {"stiffness", &Acting::stiffness, r}, {"damping", &Acting::damping, r},
           {"impedance", &Acting::impedance, 5 * r}, {"row_give", &Acting::row_give, r}, {"most", &Acting::most, r},
@@ -362,7 +362,7 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
   std::vector<Evaluated> into(n);
   bind<double, Evaluated>(
       found,
-      {{"opened", &Evaluated::opened, k}, {"turned", &Evaluated::turned, k * t * nv},
+      {{"soft", &Evaluated::soft, k}, {"opened", &Evaluated::opened, k}, {"turned", &Evaluated::turned, k * t * nv},
        {"forces", &Evaluated::forces, k * c.each()}, {"gap", &Evaluated::scaled_gap, r},
        {"normal", &Evaluated::scaled_normal, r * nv}, {"impulse", &Evaluated::impulse, r * nv},
        {"bound", &Evaluated::bound, c.bounded}, {"unit", &Evaluated::unit, r},
@@ -425,7 +425,7 @@ NB_MODULE(_mujoco, m) {
         "tangent"_a, "friction"_a, "geom"_a, "near"_a,
         "Contacts of many states. Returns where MuJoCo said an error or warned.");
   m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
-        "acceleration"_a, "A"_a, "B"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
+        "acceleration"_a, "rates"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
         "Motion at many states. Returns where MuJoCo said an error or warned.");
   m.def("read_rest", &read_rest, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "inverse_mass"_a, "force"_a,
         "nominal"_a, "length"_a, "moment"_a, "tendon"_a,

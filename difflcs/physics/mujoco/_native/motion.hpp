@@ -34,7 +34,7 @@ struct Motion {
 
 // One row of each array of `Linearised` in motion.py.
 struct Linearised {
-  double *middle, *acceleration, *A, *B, *inverse_mass, *nominal, *reached;
+  double *middle, *acceleration, *rates, *inverse_mass, *nominal, *reached;
 };
 
 // Reads the motion at a state of qpos, qvel and act, with nominal controls, NaN where actuators have no force.
@@ -118,7 +118,7 @@ class Reader {
     }
   }
 
-  // Write what `mjd_transitionFD` says of velocities and activation after a step of one second: rates there are now.
+  // Write differences of the rates of velocities and activation that there are now, like those of `mjd_transitionFD`.
   void differentiate(const Linearised& into, double* now) const {
     const Motion& m = motion_;
     const int nx = m.size(), begins[] = {0, m.nv, 2 * m.nv, nx}, stages[] = {0, kPositions, kVelocities, kVelocities};
@@ -142,8 +142,7 @@ class Reader {
         for (int i = m.nv; i < nx; i++) {
           if (m.tree[i] != m.tree[j] || side(j) == 0) continue;
           const double rate = i < 2 * m.nv ? place_.qacc[i - m.nv] : place_.act_dot[i - 2 * m.nv];
-          const double change = (i == j) + (rate - into.acceleration[i - m.nv]) / (side(j) * kDifference);
-          (j < nx ? into.A[i * nx + j] : into.B[i * m.nu + j - nx]) = change;
+          into.rates[(i - m.nv) * (nx + m.nu) + j] = (rate - into.acceleration[i - m.nv]) / (side(j) * kDifference);
         }
       }
       set(now);

@@ -15,13 +15,14 @@ constexpr double kPressedFrom = 0.4, kPressedTo = 10;  // the same of what drive
 constexpr double kSideways = 0.2, kDown = 0.05;        // of the motion without contact: more is no creep
 constexpr double kLoad = 100.0, kDeepest = 5.0;        // acceleration [m/s²] of any load; depth by one, of the usual
 constexpr double kPresses = 0.7;                       // of what friction may press back into its contact
+constexpr double kExact = 0.03;                        // of the compliance: how exactly forces are computed
 constexpr int kPasses = 2;      // each reduces what is left of compliance and opening by their parts of the motion
 constexpr int kMostSteps = 10;  // in which a row is followed through a step
 
 // What all states have in common, see `Situation` and `Recovery` in nominal.py.
 struct Common {
   int nv, nx, columns, contacts, tangents, rows, bounded, steps;
-  double seconds, give, compliance, usual;
+  double seconds, give, compliance, least, usual;  // compliance in parts of `give`, and of a contact's own way at least
   bool opens;
   const bool *rough, *firm;
   const int64_t* tree;
@@ -29,18 +30,19 @@ struct Common {
 
   int each() const { return tangents > 0 ? 2 * tangents : 1; }
   int limits() const { return rows - bounded; }
+  double exact() const { return kExact * compliance; }
 };
 
 // Of a state: its contacts, rows with their softness, and the step.
 struct Acting {
   const double *gap, *normal, *tangent, *friction, *row_gap, *row_normal, *bend, *stiffness, *damping, *impedance,
-      *row_give, *most, *x, *step, *delayed, *response, *inverse_mass, *soft;
+      *row_give, *most, *x, *step, *delayed, *response, *inverse_mass;
   const int64_t* geom;
 };
 
 // What is found: fields of `Nominal`, those of `ScaledRows` after `forces`.
 struct Evaluated {
-  double *opened, *turned, *forces, *scaled_gap, *scaled_normal, *impulse, *bound, *unit, *row_forces, *carried;
+  double *soft, *opened, *turned, *forces, *scaled_gap, *scaled_normal, *impulse, *bound, *unit, *row_forces, *carried;
 };
 
 inline bool is_zero(const double* row, int n) {
@@ -163,7 +165,7 @@ class Rays {
       for (int v = 0; v < nv; v++) gives_[v * m + i] = along_[v] * c.seconds / c.give;
     }
     for (int i = 0; i < m; i++) multiply(ray(i), gives_.data(), nv, m, &F_[i * m]);
-    for (int i = 0; i < m; i++) F_[i * m + i] += c.compliance;
+    for (int i = 0; i < m; i++) F_[i * m + i] += c.exact();
   }
 
   // Write where forces move ζ from `place`, with gaps of contacts, and the forces (of all rays of contacts, of rows),
@@ -178,9 +180,9 @@ class Rays {
     for (size_t i = 0, next = 0; i < number_.size(); i++) {
       const int at = number_[i];
       const double start = forces[at] * c.give;
-      const double apart = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.compliance * start;
+      const double apart = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.exact() * start;
       if (static_cast<int>(next) == m || some_[next] != static_cast<int>(i)) {  // nothing moves along it
-        forces[at] = std::clamp(-apart / c.compliance, low_[i], high_[i]) / c.give;
+        forces[at] = std::clamp(-apart / c.exact(), low_[i], high_[i]) / c.give;
         continue;
       }
       next++;
@@ -190,7 +192,7 @@ class Rays {
       largest_.push_back(high_[i]);
     }
     const bool found =
-        m == 0 || solver_.solve(F_.data(), q_.data(), least_.data(), largest_.data(), c.compliance, m, lam_.data());
+        m == 0 || solver_.solve(F_.data(), q_.data(), least_.data(), largest_.data(), c.exact(), m, lam_.data());
     for (int i = 0; i < m; i++) forces[number_[some_[i]]] = lam_[i] / c.give;
     for (int v = 0; v < nv; v++) moved[v] = place[v] + dot(&gives_[v * m], lam_.data(), m);
     return found;
@@ -225,6 +227,7 @@ class Evaluation {
     exact_ = true;
     velocity_ = a.x + nv;
     resize();
+    soften_contacts();
     reach(nullptr, place_.data());
     evaluate(false);
     if (c.rows == 0 || c.contacts == 0) return exact_;
@@ -251,6 +254,20 @@ class Evaluation {
     forces_.resize(k * c.each() + c.rows);
     held_.resize(c.rows * nv);
     pushed_.resize(nv * nv);
+  }
+
+  // Write the compliance of each contact of the system. One that is far stiffer than what it moves, as those of light
+  // links are, makes plans creep.
+  void soften_contacts() const {
+    const Common& c = *common_;
+    const Acting& a = *acting_;
+    for (int i = 0; i < c.contacts; i++) {
+      double along = 0;
+      for (int r = 0; r < c.tangents; r++)
+        along = std::max(along, give_way(a.tangent + (i * c.tangents + r) * c.nv, a.response, c.nv));
+      const double own = give_way(a.normal + i * c.nv, a.response, c.nv) + a.friction[i] * a.friction[i] * along;
+      into_->soft[i] = std::max(c.compliance, c.least * c.seconds * own / c.give);
+    }
   }
 
   // Write ζ and ν afterwards with the nominal action, with `carried` added to motion without contact.
@@ -611,7 +628,7 @@ class Evaluation {
         const double speed = dot(row, velocity_, nv), crept = -creep * acceleration;
         if (!(crept * speed > 0)) continue;
         const double far = std::copysign(std::min(std::fabs(speed), std::fabs(crept)), speed);
-        const double more = c.seconds * a.friction[i] * far / (a.soft[i] * c.give);
+        const double more = c.seconds * a.friction[i] * far / (into_->soft[i] * c.give);
         force[0] += more;
         force[1] -= more;
       }
