@@ -1,11 +1,14 @@
 """PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
 import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_choice, check_kind, check_number, check_positive_int, takes_arrays
+from difflcs._checks import check_choice, check_number, check_positive_int, takes_arrays, to_tensor
 from difflcs._differentiation import runs_eagerly
 from difflcs._fields import register
 from difflcs._modules import fresh
@@ -34,6 +37,28 @@ from difflcs.status import Status, solved
 
 HARD, SMOOTH = 1e-7, 1e-5
 """Relaxation by default: of plans that are executed, nearly hard contact; and in training, for gradients."""
+
+
+def _optional(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else check(value)
+
+
+_SETTINGS: dict[str, Callable[[Any], Any]] = {
+    "lcs": check_system,
+    "cost": check_cost,
+    "horizon": partial(check_positive_int, "horizon"),
+    "passes": partial(check_positive_int, "passes"),
+    "relaxation": _optional(partial(check_number, "relaxation", strict=True)),
+    "training_relaxation": _optional(partial(check_number, "training_relaxation", strict=True)),
+    "barrier": partial(check_number, "barrier"),
+    "on_failure": partial(check_choice, "on_failure", choices=("raise", "mask")),
+    "backend": get_backend,
+    "constraints": _optional(check_constraints),
+    "bounds": _optional(check_stage_bounds),
+}
+"""What checks each setting of a layer, whenever it is set, and converts it."""
+_OPEN = {"u_min": -torch.inf, "u_max": torch.inf}
+"""Bounds that are none."""
 
 
 class LCSMPCLayer(nn.Module):
@@ -101,36 +126,28 @@ class LCSMPCLayer(nn.Module):
         passes: int = 1,
     ):
         super().__init__()
-        self.lcs = check_system(lcs)
-        self.cost = check_cost(cost)
-        self.horizon = check_positive_int("horizon", horizon)
-        self.passes = check_positive_int("passes", passes)
-        self.relaxation, self.training_relaxation = (
-            value if value is None else check_number(name, value, strict=True)
-            for name, value in (("relaxation", relaxation), ("training_relaxation", training_relaxation))
-        )
-        self.barrier = check_number("barrier", barrier)
-        self.on_failure = on_failure
-        self.backend = get_backend(backend)
-        self.constraints = None if constraints is None else check_constraints(constraints)
+        self.lcs, self.cost, self.horizon, self.passes = lcs, cost, horizon, passes
+        self.relaxation, self.training_relaxation, self.barrier = relaxation, training_relaxation, barrier
+        self.on_failure, self.backend, self.constraints = on_failure, get_backend(backend), constraints
         self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
-        like = cost.Q if isinstance(cost, PLAIN_COSTS) else torch.empty(0)
-        for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
-            bound = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], like)
-            register(self, name, bound, persistent=False)
+        for name, value in (("u_min", u_min), ("u_max", u_max)):
+            register(self, name, self._bound(name, value), persistent=False)
         self.setup().check()
         self._warned = False
         self._repeat = Repeat()
 
-    def setup(self) -> Setup:
-        """Collect the settings that the layer plans with now, except those of training mode.
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set a setting: what the constructor takes, with the same checks; and anything else as it is."""
+        if name in _OPEN:
+            value = self._bound(name, to_tensor(value))
+        super().__setattr__(name, _SETTINGS[name](value) if name in _SETTINGS else value)
 
-        Raises:
-            InvalidInputError and its kinds: one that was set after the layer was made does not fit.
-        """
-        check_positive_int("passes", self.passes)
-        check_choice("on_failure", self.on_failure, ("raise", "mask"))
-        check_kind("backend", self.backend, Backend, "make one, such as BatchedBackend()")
+    def _bound(self, name: str, value: Any) -> Tensor:
+        like = self.cost.Q if isinstance(self.cost, PLAIN_COSTS) else torch.empty(0)
+        return as_bound(name, _OPEN[name] if value is None else value, [("n_u", self.lcs.n_u)], like)
+
+    def setup(self) -> Setup:
+        """Collect the settings that the layer plans with now, except those of training mode."""
         if self._forward_pre_hooks:
             fresh(self, ("u_min", "u_max"))
         return Setup(

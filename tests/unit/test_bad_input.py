@@ -203,10 +203,20 @@ def test_what_does_not_fit_is_refused(build, case):
     refuse(error, match, call, build)
 
 
-@pytest.mark.parametrize(("name", "value"), [("passes", 0), ("on_failure", "ignore"), ("backend", "batched")])
-def test_settings_that_were_changed_are_checked(build, name, value):
-    setattr(mpc := layer(build), name, value)
-    refuse(e.InvalidInputError, f"{name}: expected", mpc, X)
+SET_LATER = {"lcs": None, "cost": len, "horizon": None, "passes": 0, "relaxation": 0, "training_relaxation": 0}
+SET_LATER |= {"barrier": None, "on_failure": "ignore", "backend": None, "constraints": [], "bounds": 3, "u_min": "a"}
+
+
+@pytest.mark.parametrize("name", SET_LATER)
+def test_settings_are_checked_when_they_are_changed(build, name):
+    refuse(e.InvalidInputError, f"{name}: expected", setattr, layer(build), name, SET_LATER[name])
+
+
+@pytest.mark.parametrize("bound", [None, 0.05, [0.05, 0.02], np.array([0.05, 0.02])])
+def test_a_bound_is_changed_to_what_a_layer_takes(build, bound):
+    mpc = layer(build)
+    mpc.u_max = bound
+    assert torch.equal(mpc(X + 0.2).u, layer(build, u_max=bound)(X + 0.2).u)
 
 
 @pytest.mark.parametrize("F", [-EYE, 0 * EYE, SKEW])
