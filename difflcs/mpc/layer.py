@@ -67,7 +67,7 @@ class LCSMPCLayer(nn.Module):
     Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
     respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality
     conditions (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on
-    x0's device. What the layer is built with is the default of each call.
+    x0's device. What the layer is built with is the default of each call, and can be changed: `layer.u_max = None`.
     As a stochastic policy for reinforcement learning: `difflcs.rl.LCSMPCPolicy`.
 
     Args:

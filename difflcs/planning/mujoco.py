@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_kind, check_list, check_number, check_positive_int, takes
+from difflcs._linalg import one_thread
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco import MujocoCost, MujocoLCS, Position
 
@@ -116,6 +117,7 @@ class BodyPlaces:
         return ((A @ x.unsqueeze(-1)).squeeze(-1) + offset).unflatten(-1, (-1, 3))
 
     @takes(x="n_x", points="n n_effectors 3")
+    @one_thread()
     def at(self, x: Tensor, points: Tensor) -> Tensor:
         """Find states (n, n_x) at rest near x (n_x,) with end effectors at points (n, n_effectors, 3), or near."""
         states, nv = x.repeat(len(points), 1), self.module.state.nv

@@ -293,15 +293,19 @@ ARM = """<body pos="0 0 .35"><joint name="a" axis="0 0 1" range="-3 3"/><joint n
 
 
 @pytest.mark.parametrize(("robot", "start"), [(SLIDES, (0.2, 0.0)), (ARM, (0.6, -0.6, 1.2, 0.97))])
-def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch_nothing(robot, start):
+def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch_nothing(robot, start, monkeypatch):
     servos = "".join(f'<position joint="{joint}" kp="100"/>' for joint in "abcd"[: len(start)])
     data = mujoco.MjData(model := mujoco.MjModel.from_xml_string(WORLD.format(robot, servos)))
     data.qpos[:] = [0.05, 0.1, 0.7, *start]
     module = MujocoLCS(model, data)
     places = BodyPlaces(module, "box", ["tip"], 12, gap=0.005, height=0.0)
     travel = BodyTravel(places, clearance=0.03, over=0.12, step=0.2)
-    x = module.observe(data)
+    x, solve, threads = module.observe(data), torch.linalg.solve, []
+    monkeypatch.setattr(torch.linalg, "solve", lambda *of: threads.append(torch.get_num_threads()) or solve(*of))
+    torch.set_num_threads(2)
     states = places.states(x, places.sample(x))
+    assert {*threads} == {1}  # two take ten times as long on busy cores
+    assert torch.get_num_threads() == 2
     assert len(states) == 12
     torch.testing.assert_close(states[:, :3], x[:3].expand(12, 3))
     assert float(states[:, 3].max()) <= (0.5 if robot is SLIDES else 3.0)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_threads, describe, make_plain
-from difflcs._linalg import matvec
+from difflcs._linalg import matvec, one_thread
 from difflcs.errors import DTypeError
 from difflcs.lcp import solve_lcp
 from difflcs.mpc.backends.base import Backend, Result, check_plain, replace_failed
@@ -220,17 +220,6 @@ class RelaxedBackend(Backend):
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run torch on one thread: with two, the tiny batched products took 20 times as long on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
 def _cvxpylayers() -> Iterator[None]:
     """Call cvxpylayers without the one warning that version 1.2 causes with NumPy 2 at every call.
 
@@ -275,7 +264,7 @@ class _Program(NamedTuple):
         return torch.cat([self.u_min, least], 1), torch.cat([self.u_max, least + torch.inf], 1)
 
 
-@_one_thread()
+@one_thread()
 def _condense(t: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float) -> _Program:
     """Build the program; differentiable in the inputs and the nominal actions (batch, H, n_u)."""
     batch, horizon, n_u = nominal.shape
@@ -351,14 +340,14 @@ def _layer(n: int, n_u: int, n_s: int, barrier: float) -> CvxpyLayer:
     )
 
 
-@_one_thread()
+@one_thread()
 def _pull(outputs: list[Tensor], inputs: list[Tensor], bars: list[Tensor]) -> list[Tensor]:
     """Compute the gradients of the inputs, zero where nothing depends on one."""
     options = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
     return list(torch.autograd.grad(outputs, inputs, bars, **options))
 
 
-@_one_thread()
+@one_thread()
 def _polish(problem: MPCProblem, program: _Program, z: Tensor, mu: Tensor) -> tuple[Primal, Tensor]:
     """Improve a plan by Newton steps on the program with its active bounds held; each element keeps its best point.
 
