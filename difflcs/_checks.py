@@ -219,8 +219,9 @@ def all_finite(*values: Tensor) -> bool:
 
 def numbers_of(tensor: Tensor) -> int | None:
     """Return a number that says whether the numbers of a tensor have changed; None where they cannot be read."""
-    unread = transforms_active() or is_wrapped(tensor)
-    return None if unread else hash(tensor.detach().cpu().numpy().tobytes())
+    if transforms_active() or is_wrapped(tensor):
+        return None
+    return _kernels.fingerprint(np.ascontiguousarray(tensor.detach().cpu().numpy()).reshape(-1).view(np.uint8))
 
 
 def check_kind(name: str, value: object, kind: type[R] | tuple[type[R], ...], remedy: str = "") -> R:

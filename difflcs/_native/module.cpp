@@ -495,6 +495,25 @@ bool all_finite(const std::vector<Array>& arrays) {
   });
 }
 
+// A number that says whether bytes have changed, by rounds of XXH64 (Y. Collet) of eight words side by side.
+uint64_t fingerprint(const nb::ndarray<const uint8_t, nb::ndim<1>, nb::device::cpu, nb::c_contig>& bytes) {
+  constexpr uint64_t first = 0x9E3779B185EBCA87u, second = 0xC2B2AE3D27D4EB4Fu;
+  uint64_t lanes[8] = {first, second, 3, 4, 5, 6, 7, bytes.size()};
+  const auto mix = [](uint64_t& lane, uint64_t word) {
+    lane += word * second;
+    lane = (lane << 31 | lane >> 33) * first;
+  };
+  const uint8_t *from = bytes.data(), *end = from + bytes.size();
+  for (; end - from >= 64; from += 64) {
+    uint64_t words[8];
+    std::memcpy(words, from, sizeof words);
+    for (int k = 0; k < 8; k++) mix(lanes[k], words[k]);
+  }
+  for (; from != end; from++) mix(lanes[0], *from);
+  for (int k = 1; k < 8; k++) mix(lanes[0], lanes[k]);
+  return lanes[0];
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
@@ -506,6 +525,7 @@ NB_MODULE(_kernels, m) {
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
   m.def("tolerances", &tolerances, "Tolerances that the reference in Python has too.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
+  m.def("fingerprint", &fingerprint, "bytes"_a, "A number that says whether bytes have changed.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
         "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),

@@ -169,25 +169,24 @@ def correct(
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
     mass = step.motion.in_tree / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
 
-    def size(moved: NDArray[Any]) -> Array:
-        """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
-        return np.sqrt((moved[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0])
-
     energy = mass.swapaxes(-1, -2) @ (C[:, nv : 2 * nv] * forces[:, None]) ** 2
     energy[:, :, :n_contacts] *= hard[:, None]  # soft contacts press all the time, whatever moves
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
-    speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
-    motion = size(speed) + np.minimum(size(free), _HELD * (size(speed) + size(change)))
-    worse = (size(wrong) - size(change)) / (_WORSE * motion + 1e-9)
-    slight = (2 - size(wrong) / (_SLIGHT * motion + 1e-9)) * (not step.motion.firm.any())
+    # Sizes (n, n_trees) of velocities by their energy: what is wrong, before, the change, and that without forces.
+    off, before, changed, alone = (
+        np.sqrt((v[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0]) for v in (wrong, x, change, free)
+    )
+    moves = before + changed
+    motion = before + np.minimum(alone, _HELD * moves)
+    worse = (off - changed) / (_WORSE * motion + 1e-9)
+    slight = (2 - off / (_SLIGHT * motion + 1e-9)) * (not step.motion.firm.any())
     share = energy[:, :, :n_contacts].sum(-1) / total
     # What contacts jam stands with any action.
-    pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (size(speed) + size(free)), 1e-300))
+    pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (before + alone), 1e-300))
     counts = 1 - share / pressed * (1 - np.clip(np.maximum(worse, slight), 0.0, 1.0))
-    moves = size(speed) + size(change)
-    least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
-    doubtful = (size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)
+    least = np.maximum(_FAR * (moves + alone), _SMALL * (moves + alone).sum(1, keepdims=True))
+    doubtful = (off > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)
     # A difference that grew with a force that actions change by far would be many times as large with some. Dry
     # friction far below its bound is whatever holds, so it does not grow with this either.
     of_rows = slice(n_contacts, n_contacts + n_limits + n_bounded)
@@ -197,7 +196,7 @@ def correct(
     firm[:, n_limits:] *= np.abs(forces[:, of_rows][:, n_limits:]) / np.maximum(bound, 1e-300)
     energy[:, :, of_rows] *= firm[:, None]
     grow = energy.sum(-1)
-    due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15)) * grow / total
+    due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(off, 1e-15)) * grow / total
     part = energy / np.where(forces != 0, forces, 1.0)[:, None] / np.maximum(grow, 1e-20)[:, :, None]
     both = np.tile(step.motion.of_tree, 2)
     by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
