@@ -15,12 +15,11 @@ from typing import Any
 import tyro
 
 from difflcs import zoo
-from difflcs.cli.train import flatten
 from difflcs.errors import CheckpointError, DiffLCSError
 from difflcs.rl import write_atomically
 from difflcs.rl.methods import DEFAULT_METHOD
 from difflcs.rl.runs.checkpoint import RunDirectory
-from difflcs.rl.runs.training import TrainConfig, stored_config
+from difflcs.rl.runs.training import TrainConfig, flatten, stored_config
 from difflcs.rl.tasks import get_task
 
 

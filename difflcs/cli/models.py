@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from difflcs import zoo
+from difflcs._checks import check_positive_int
 from difflcs._optional import require, versions
 from difflcs._storage import check_place, place_to_write
 from difflcs.errors import InvalidInputError
@@ -161,6 +162,7 @@ class Plot:
 
     def run(self) -> None:
         """Run the command."""
+        check_positive_int("episodes", self.episodes)
         learned = TrainedPolicy.open(self.model)
         out = self.out or (Path() if learned.run is None else learned.run.path)
         check_place("out", out)

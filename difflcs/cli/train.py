@@ -3,7 +3,7 @@
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -17,7 +17,7 @@ from difflcs.rl.methods import DEFAULT_METHOD, get_method, method_names
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.figures import NoPictureError, plot_learning_curve
 from difflcs.rl.runs.progress import Progress
-from difflcs.rl.runs.training import TrainConfig, stored_config, sum_seconds, train
+from difflcs.rl.runs.training import TrainConfig, flatten, stored_config, sum_seconds, train
 from difflcs.rl.tasks import get_task, is_installed, task_names
 from difflcs.zoo import success_text
 
@@ -82,14 +82,6 @@ class Train(TrainConfig):
         """Return the command line that knows method and task: that of the script with one of them, or our own."""
         own = type(config.method).__module__.startswith("difflcs.") and is_installed(config.task)
         return "difflcs" if own else f"python {sys.argv[0]}"
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested settings: dotted name → value."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
 
 
 def train_command(words: Sequence[str]) -> type[Train]:

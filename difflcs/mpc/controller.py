@@ -179,11 +179,12 @@ class MPCController:
         """Write the file that `load` and the C library read, atomically.
 
         Raises:
-            InvalidInputError: system or cost may depend on the state.
+            InvalidInputError: system or cost may depend on the state, or the file cannot be written.
         """
         if self._setup is not None:
             controller_file.check_constant(self._setup)
-        _storage.write_atomically(Path(path), self._content)
+        with _storage.place_to_write(Path(path), "path"):
+            _storage.write_atomically(Path(path), self._content)
 
     def step(
         self,

@@ -16,6 +16,7 @@ from difflcs._checks import (
     check_kind,
     check_positive_definite,
     check_same_device,
+    check_shape,
     check_tensor,
     describe,
 )
@@ -182,7 +183,7 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
     support = getattr(system, "action_support", None)
     if support is None:
         return u_min, u_max
-    low, high = support.to(u_min).unbind()
+    low, high = check_shape("action_support", support, "2 n_u", {"n_u": system.n_u}).to(u_min).unbind()
     limits = u_min.clamp_min(low), u_max.clamp_max(high)
     if not is_wrapped(limits[0]) and bool((limits[0] > limits[1]).any()):
         raise BoundsError(
@@ -197,7 +198,7 @@ def check_system(lcs: object) -> System:
     if not isinstance(lcs, LCSParams | LCSSequence) and not isinstance(lcs, LCSModule):
         raise DTypeError(
             f"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got {describe(lcs)}; a module "
-            f"needs n_x, n_u, n_lam and params(x, context)"
+            f"needs n_x, n_u, n_lam and params(x, context); LCSSequence.stack takes a list of systems, one per stage"
         )
     return lcs
 

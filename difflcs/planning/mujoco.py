@@ -46,7 +46,8 @@ class BodyPlaces:
         n_places: at equal angles, for each end effector and each height.
         gap: between an end effector at a place and the body [m]; None: a tenth of `module.length`.
         reach: largest gap at which pushing is considered [m]; None: `module.length`.
-        height: of places above the middle of the body [m]; None: as high as the end effector is.
+        height: of places above the middle of the body [m]; None: as high as the end effector is, so that there is no
+            place where it is above or below the body.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -69,7 +70,8 @@ class BodyPlaces:
         self.n_x, self.n_effectors, self.n_place = module.n_x, len(names), 3 * len(names)
         self.gap = 0.1 * module.length if gap is None else check_number("gap", gap, strict=True)
         self.reach = module.length if reach is None else check_number("reach", reach)
-        self.height, model = height, module._model
+        self.height = None if height is None else check_number("height", height, -math.inf)
+        model = module._model
         self._model, self._data, self._axis = model, mujoco.MjData(model), module._finder.axis
         frames = self._cost._scene.frames
         carriers = [i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i]) for kind, i in frames]

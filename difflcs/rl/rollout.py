@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import describe
+from difflcs._checks import describe, to_tensor
 from difflcs.constraints import StageBounds
 from difflcs.errors import DegenerateWarning, DTypeError, InvalidInputError, NonFiniteError, SolveWarning
 
@@ -44,7 +44,7 @@ class Policy(Protocol):
     """Maps states (B, n_x), goals (B, n_goal) and optional bounds (n_u,) to plans, as an `LCSMPCLayer` does.
 
     A context (B, n_context), if the environment has one, is passed by the keyword `context`. A function or module that
-    takes no bounds is a policy, too; and so is one that returns actions (B, n_u).
+    takes no bounds is a policy, too; and so is one that returns actions (B, n_u), also as a NumPy array.
     """
 
     def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None, u_max: Tensor | None) -> Any:
@@ -127,7 +127,7 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
         keywords: Any = bounds if context is None else {**bounds, CONTEXT: context}
         with torch.no_grad(), ignore_solver_warnings():
-            found = actor(state, goal, **keywords)
+            found: Any = to_tensor(actor(state, goal, **keywords))
         if hasattr(found, "converged"):
             return found.action.numpy(), (~found.converged).numpy()
         if not isinstance(found, Tensor) or found.shape[:-1] != state.shape[:1]:

@@ -259,7 +259,7 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
 def test_a_run_is_not_continued_with_another_configuration_or_environment(finished, tmp_path):
     name = "violation"
     for change in ({"seed": 1}, {"minutes": 3.5}, {"evaluate_goals": 2}):
-        with pytest.raises(CheckpointError, match="drop the changes"):
+        with pytest.raises(CheckpointError, match=f"expected {next(iter(change))} = .*, got "):
             train(make_config(name, **change), finished(name).path, resume=True)
     described = replace(TOY, describe=lambda env: {"mass": 1.0})
     with pytest.raises(KeyboardInterrupt):

@@ -167,6 +167,7 @@ def run_of(out: Path) -> SimpleNamespace:
         (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
         (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
+        (["plot", "zoo:trifinger-cube", "--episodes", "0"], "episodes: expected at least 1"),
         (
             ["train", "--warmup.noise", "-1"],
             "difflcs: --warmup.noise: expected a finite 0 <= noise, got -1.0; change it\n",

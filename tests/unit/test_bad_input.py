@@ -178,6 +178,9 @@ FITS_NOT = {  # what does not fit, the error, and what it says
     "no guess": (lambda b: layer(b)(X, guess=X), e.DTypeError, "guess: expected an MPCSolution or a Primal"),
     "no mode": (lambda b: layer(b, on_failure="ignore"), e.InvalidInputError,
      "on_failure: expected one of 'raise', 'mask', got 'ignore'"),
+    "an action support of other actions": (
+     lambda b: layer(b, lcs=(model := b.model(), setattr(model, "action_support", torch.zeros(3, 2).double()))[0])(X),
+     e.ShapeError, r"action_support: expected shape \(2, n_u=2\), got \(3, 2\)"),
     "no LCS": (lambda b: layer(b, lcs=nn.Linear(2, 2)), e.DTypeError,
      r"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got Linear.*; a module needs"),
     "no cost": (lambda b: layer(b)(X, cost=len), e.DTypeError,

@@ -52,6 +52,7 @@ def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, na
     assert repr(loaded) == repr(controller).replace("time_limit=None", "time_limit=60.0")
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
+    refuse(InvalidInputError, "path: expected a place to write", loaded.save, tmp_path)
     for x in problem.tensors["x0"][:4]:
         solution = mpc(x, guess=None if solution is None else solution.shift())
         u, plan = controller.step(x.numpy()), controller.plan

@@ -328,6 +328,7 @@ def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch
     assert travel.arrived(x, target)
     refuse(InvalidInputError, "effectors: expected", BodyPlaces, module, "box", ["box"])
     refuse(InvalidInputError, "may touch the body None", BodyPlaces, module, None, ["tip"])
+    refuse(InvalidInputError, "height: expected a number", BodyPlaces, module, "box", ["tip"], height="low")
     refuse(
         InvalidInputError, r"effectors\[0\]: expected a .*'tap' \(did you mean tip", BodyPlaces, module, "box", ["tap"]
     )

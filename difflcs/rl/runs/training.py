@@ -203,6 +203,14 @@ def stored_config(run: RunDirectory) -> TrainConfig:
     return TrainConfig.from_json(values)
 
 
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings: dotted name → value."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
+
+
 def load_model(path: Path | str) -> LCSModel:
     """The model of a run directory (finished or not), of `LCSModel.save_pretrained`, or of the zoo ("zoo:NAME").
 
@@ -310,9 +318,12 @@ class _Training:
         if not run.finished():
             with wrap_os_errors(self.out):
                 held.enter_context(run.locked())
-        if stored_config(run) != self.config:
+        before, now = (flatten(config.to_json()) for config in (stored_config(run), self.config))
+        if changed := [name for name in {**before, **now} if before.get(name) != now.get(name)]:
+            name = changed[0]
             raise CheckpointError(
-                f"{self.out}: expected the configuration it was started with, got another; drop the changes"
+                f"{self.out}: expected {name} = {before.get(name)!r}, as it was started with, got {now.get(name)!r}; "
+                f"drop the change"
             )
         source = run.config().get("init")
         if not isinstance(source, str | None):
