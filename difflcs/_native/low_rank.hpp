@@ -337,7 +337,7 @@ class LowRank {
         for (int64_t j = 0; j <= i; j++) {
           Vec sum = i == j ? own - rest[unknown[i]] : shared(i, j);
           for (int64_t m = 0; m < j; m++) sum -= L(i, m) * L(j, m);
-          if (i == j) dominant = !any((rest[unknown[i]] < kLeastRest) | ((sum <= 0) & (right[i] > 0)));
+          if (i == j) dominant = !any((rest[unknown[i]] < kLeastRest) | ((sum <= 0) & (right[i] > kLowRankRounding)));
           L(i, j) = i == j ? sqrt(max(sum, all(0))) : select(L(j, j) > 0, sum / L(j, j), all(0));
         }
       }
