@@ -29,6 +29,9 @@ inline void lcp_slack(int64_t n, const T* F, const Vec* q, const Vector& lam, Ve
   }
 }
 
+// Where lam o w differs from eps by more than this part of it, a solution is polished.
+constexpr double kMissed = 1e-7;
+
 // T is the type of an entry of F: double where all lanes share it, else Vec. N is the size where it is known when
 // compiling, else zero; `kMayPivot` can eliminate with row exchanges.
 template <class T, int64_t N, bool kMayPivot>
@@ -94,7 +97,7 @@ class RelaxedLcp {
       advance(eps4, done, 8);
     }
     finish(lam_out, w_out, eps, skip);
-    if (kMayPivot && lu.pivot) polish(lam_out, w_out, eps, skip);
+    if (kMayPivot && (lu.pivot || unlike())) polish(lam_out, w_out, eps, skip);
   }
 
   // From eps = 1 down to `target`. Returns the lanes that converged; `bound` is scratch.
@@ -143,14 +146,48 @@ class RelaxedLcp {
     return any(lam + w <= 0) ? lam + w - root : (4.0 * lam * w - eps4) / (lam + w + root);
   }
 
+  // to = q + F x
+  template <class Vector, class To>
+  DIFFLCS_INLINE void slack(Vector& x, To& to) {
+    if (short_cut())
+      low_rank->slack(F, &x[0], q, &to[0]);
+    else
+      multiply(F, x, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { to[i] = t; });
+  }
+
+  // `step` becomes (diag(a) + diag(b) F)^-1 step, after `row` has told a_i and b_i of every row, from the first on.
+  struct Row {
+    Vec a, b;
+  };
+  template <class Rows>
+  DIFFLCS_INLINE void eliminate(Rows row) {
+    const int64_t n = size();
+    const bool short_cut = this->short_cut();
+    DIFFLCS_UNROLL
+    for (int64_t i = 0; i < n; i++) {
+      const Row weights = row(i);
+      if (short_cut) {
+        low_rank->weigh(i, weights.a, weights.b);
+        continue;
+      }
+      DIFFLCS_UNROLL
+      for (int64_t j = 0; j < n; j++) jacobian[i * n + j] = weights.b * F(i, j);
+      jacobian[i * n + i] += weights.a;
+    }
+    if (short_cut) {
+      low_rank->factor();
+      low_rank->solve(&step[0]);
+    } else {
+      lu.factor(n, jacobian, rows);
+      lu.solve(n, jacobian, rows, step);
+    }
+  }
+
   // w, root and the squared norm of g at `next`.
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
     Vec sum = all(0);
-    if (short_cut())
-      low_rank->slack(F, &next[0], q, &w_next[0]);
-    else
-      multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
+    slack(next, w_next);
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
       const Vec t = w_next[i], diff = next[i] - t;
@@ -179,26 +216,11 @@ class RelaxedLcp {
   // lanes that are not `done`. The generalised Jacobian of g is diag(a) + diag(b) F, a = 1 - ratio and b = 1 + ratio.
   DIFFLCS_INLINE void advance(Vec eps4, Mask done, int trials) {
     const int64_t n = size();
-    const bool short_cut = this->short_cut();
-    DIFFLCS_UNROLL
-    for (int64_t i = 0; i < n; i++) {
-      const Vec ratio = (lam[i] - w[i]) / root[i], b = 1.0 + ratio;
+    eliminate([&](int64_t i) {
+      const Vec ratio = (lam[i] - w[i]) / root[i];
       step[i] = unlike() ? -exact_g(lam[i], w[i], root[i], eps4) : root[i] - lam[i] - w[i];
-      if (short_cut) {
-        low_rank->weigh(i, 1.0 - ratio, b);
-        continue;
-      }
-      DIFFLCS_UNROLL
-      for (int64_t j = 0; j < n; j++) jacobian[i * n + j] = b * F(i, j);
-      jacobian[i * n + i] += 1.0 - ratio;
-    }
-    if (short_cut) {
-      low_rank->factor();
-      low_rank->solve(&step[0]);
-    } else {
-      lu.factor(n, jacobian, rows);
-      lu.solve(n, jacobian, rows, step);
-    }
+      return Row{1.0 - ratio, 1.0 + ratio};
+    });
     Vec length = all(1), merit_next = merit;
     for (int trial = 0; trial < trials; trial++) {
       DIFFLCS_UNROLL
@@ -229,23 +251,26 @@ class RelaxedLcp {
     }
   }
 
-  // The root of g loses the smaller of lam and w where they differ by 1e16, and a large entry of F carries that into
-  // other rows. Newton on lam o (F lam + q) = eps itself, from a point that is nearly there, does not:
-  // (diag(w) + diag(lam) F) dlam = eps - lam o (F lam + q).
+  // The root of g loses the smaller of lam and w where they differ by 1e16, and what `finish` makes of a large force, or
+  // that loss, is carried into other rows by large entries of F. Newton on lam o (F lam + q) = eps itself, from a point
+  // that is nearly there, mends it: (diag(w) + diag(lam) F) dlam = eps - lam o (F lam + q), by rows in parts of lam + w.
   DIFFLCS_INLINE void polish(Vec* lam_out, Vec* w_out, Vec eps, Mask skip) {
     const int64_t n = size();
+    Vec before = all(1e300);
     for (int iteration = 0; iteration < 4; iteration++) {
+      slack(lam_out, step);
+      Vec missed = all(0);
       for (int64_t i = 0; i < n; i++) {
-        Vec t = q[i];
-        for (int64_t j = 0; j < n; j++) {
-          t += F(i, j) * lam_out[j];
-          jacobian[i * n + j] = lam_out[i] * F(i, j);
-        }
-        jacobian[i * n + i] += w_out[i];
-        step[i] = eps - lam_out[i] * t;
+        step[i] = eps - lam_out[i] * step[i];
+        missed = max(missed, abs(step[i]) / eps);
       }
-      lu.factor(n, jacobian, rows);
-      lu.solve(n, jacobian, rows, step);
+      if (!lu.pivot && !any((missed > kMissed) & (missed < 0.5 * before))) break;
+      before = missed;
+      eliminate([&](int64_t i) {
+        const Vec unit = 1.0 / (lam_out[i] + w_out[i]);
+        step[i] *= unit;
+        return Row{w_out[i] * unit, lam_out[i] * unit};
+      });
       Mask keep = skip;  // a step that would leave the interior, or is not a number
       for (int64_t i = 0; i < n; i++) keep |= ~(abs(step[i]) <= 0.5 * lam_out[i]);
       for (int64_t i = 0; i < n; i++) {
