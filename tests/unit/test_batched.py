@@ -344,6 +344,17 @@ def test_a_force_of_another_size_does_not_hide_the_others(build):
     assert mpc.eval()(0 * n(6), 0 * n(6) + 1).iterations < 60
 
 
+def test_caps_that_forces_reach_by_far_larger_sums_do_not_hide_their_gaps(build):
+    """A gap of 1e-6 feels the rounding of a sum of 100 through the cap's force; without polish all is solved again."""
+    n = build.normal(0)
+    rows, B, caps = n(48, 6), 0.3 * n(6, 3), torch.zeros(48, 48).double()
+    rows[44:], caps[:44, 44:] = 0.0, torch.eye(4).double().repeat_interleave(11, 0)
+    F, c = rows @ rows.mT + 0.001 * torch.eye(48) + caps - caps.mT, torch.tensor([*[-1.0] * 44, *[100.0] * 4]).double()
+    lcs = LCSParams(torch.eye(6).double(), B, 0.01 * rows.mT, 0 * n(6), rows, rows @ B, F, c)
+    mpc = LCSMPCLayer(lcs, GoalCost.reach(6, 3, (1.0,) * 6, 0.01), 4, -1.0, 1.0, BatchedBackend(restarts=1), 1e-5)
+    assert mpc.eval()(0 * n(6), 0 * n(6) + 1).iterations < 22
+
+
 def test_iterations_hardly_grow_with_the_horizon():
     cost = GoalCost.reach(8, 1, goal_weight=[5.0] * 4 + [0.5] * 4, input_weight=0.005)
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)
