@@ -141,8 +141,8 @@ struct Certificate {
       y[i] = t;
     }
     form();
-    lu_factor(nl, N);
-    lu_solve(nl, N, y);
+    lu_factor_by_panels(nl, N);
+    lu_solve_by_rows(nl, N, y);
     Vec missed = missing(lk);
     const Mask poor = ~(missed <= 1e-11);
     if (!any(poor)) return missed;
