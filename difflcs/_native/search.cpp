@@ -35,7 +35,9 @@ constexpr int64_t kNear = 2;
 // If of half of the starts, kHalf for each action at least, one in kFound finds the best plan and at most one in kLone
 // ends where no other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Four
 // that agree so are spared the local search. Starts after the first kFixed are left where they seem not to come below the
-// best cost by this part of it.
+// best cost by this part of it. A start of problems that are solved one by one costs as much as the first: of theirs half
+// are enough, whatever the number of actions, and the local search ends with the first round in vain, unless contacts are
+// sought at last.
 constexpr int64_t kHalf = 8, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
 constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
@@ -224,6 +226,9 @@ int64_t finders(const double* reached, int64_t count, double one) {
 // Rounds that the local search of a long plan has besides those in vain that end it.
 int64_t longer(const MpcBatch& b, int64_t starts) { return starts * std::min(b.horizon, kLong) / kLong; }
 
+// Whether its problems are solved one by one.
+bool large(const MpcBatch& b) { return b.n_x + b.n_u >= kAlone || b.n_lam >= kAloneForces; }
+
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
   const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
@@ -288,8 +293,7 @@ void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       kernels, batch, solve.max_iter == 0,  // which takes no time
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        const bool large = c.batch.n_x + c.batch.n_u >= kAlone || c.batch.n_lam >= kAloneForces;
-        const auto solve = c.batch.count == 1 || large ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
+        const auto solve = c.batch.count == 1 || large(c.batch) ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
         solve(c.batch, c.solve, &c.next, workspace, watch);
       },
       &context);
@@ -444,7 +448,9 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   const Sizes n(batch);
   const MpcPlans out = grouped.plans();
   const bool guessed = guess.u && start == 0, whole = guess.lam;  // by actions alone, or by forces too
-  const int64_t starts = effort.starts, half = starts < kVaried ? starts : std::max(kHalf * batch.n_u, starts / 2);
+  const bool brief = large(batch) && effort.seeks == 0;
+  const int64_t starts = effort.starts, least = brief ? kHalf : kHalf * batch.n_u;
+  const int64_t half = starts < kVaried ? starts : std::max(least, starts / 2);
   const int64_t shift = guess.u ? 1 : 0;
 
   tried.resize(batch, 0);
@@ -495,7 +501,7 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   }
 
   finish(batch, guess, effort, out, runner, first);
-  patience.assign(count, kRounds);
+  patience.assign(count, brief ? 1 : kRounds);
   for (int64_t e : live) {
     const double* own = reached.data() + e * starts;
     const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;
@@ -737,7 +743,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) {
         idle[e] = -1;
         ended[e] = 0;  // no start found it
-        if (!seeking) patience[e] = std::max(kRounds, starts) + longer(batch, starts);
+        if (!seeking && patience[e] > 1) patience[e] = std::max(kRounds, starts) + longer(batch, starts);
       }
       copy_plan(n, finished.plans(), i, out, e);
     }

@@ -308,6 +308,21 @@ def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of
         torch.testing.assert_close(mpc(x, goal, lcs=model).u, u, rtol=1e-9, atol=1e-9)
 
 
+def test_half_the_starts_of_a_large_problem_are_enough_for_many_actions(build):
+    n = build.normal(0)
+    rows, B, x0 = n(40, 6), 0.3 * n(6, 5), 0 * n(3, 6)
+    F = rows @ rows.mT + 0.1 * torch.eye(40)
+    lcs = LCSParams(torch.eye(6).double(), B, 0.01 * rows.mT, 0 * n(6), rows, rows @ B, F, 0 * n(40) + 1)
+    mpc, plans = LCSMPCLayer(lcs, GoalCost.reach(6, 5, (1.0,) * 6, 0.01), 4, -1.0, 1.0), []
+    for restarts in (4, 8, 16):
+        mpc.backend = BatchedBackend(restarts=restarts)
+        plans.append(mpc(x0, x0 + torch.tensor([[0.1], [0.5], [1.0]])))
+    four, half, all_ = plans
+    assert torch.equal(half.u, all_.u)
+    assert bool((half.iterations > four.iterations).all())
+    assert torch.equal(half.iterations, all_.iterations)
+
+
 @pytest.mark.parametrize("compliance", [0.3, 1e-4])
 @pytest.mark.parametrize(("shared", "capped"), [(False, False), (True, False), (True, True)])
 def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, capped, compliance):

@@ -77,7 +77,9 @@ class BatchedBackend(Backend):
     solved to the end; at a harder relaxation the plan that is found is solved once more. Half of the starts, eight for
     each action, are enough where these agree. A local search follows, unless they agree: the best plan or a
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
-    for long plans. Of four to seven starts only four of these are tried. Another group of starts is searched so where
+    for long plans. Large problems (n_lam of 40 or more, or n_x + n_u of 48) are solved one by one, and their starts are
+    not shared out on lanes: half of them are enough for any number of actions, and one round in vain ends the local
+    search. Of four to seven starts only four of these are tried. Another group of starts is searched so where
     few have found the best plan; that of all groups counts. Where many contacts are possible, "best" seeks others round
     it: the actions of a start close or open the gap of one contact for some stages as far as they can, and most such
     starts begin at softer contact.
