@@ -179,6 +179,18 @@ def test_what_is_driven_in_quasi_static_motion_stops_at_the_limits_of_its_joint(
     assert MujocoLCS(model, limits=0).action_bounds(x)[1].isinf()
 
 
+@pytest.mark.parametrize("soft", ["", "solref='.1 1'", "solref='-1000 -20'", "solref='-1000 0'"])
+@pytest.mark.parametrize("seconds", [0.002, 0.02, 0.1])
+def test_friction_that_a_rail_presses_creeps_as_in_mujoco(seconds, soft):
+    geoms = f'<geom type="box" size="1 1 .1" pos="0 0 -.11" {soft}/>', f'<geom type="box" size=".1 .1 .02" {soft}/>'
+    model = load(f'{geoms[0]}<body><joint name="j" type="slide" axis="1 0 0"/>{geoms[1]}</body>', MOTOR)
+    module, data = MujocoLCS(model, motion="dynamic", seconds=seconds), mujoco.MjData(model)
+    moved = module.params(x := module.observe(data)).step(x, torch.tensor([2.0]).double()).x_next
+    data.ctrl[:] = 2.0
+    mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
+    assert moved[1] == pytest.approx(data.qvel[0], rel=0.1)
+
+
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
 def test_a_rope_tows_what_has_no_velocity(motion):
     slides = "".join(f'<body pos="0 {i} 0"><joint name="{name}" type="slide" axis="1 0 0" frictionloss=".01"/>'

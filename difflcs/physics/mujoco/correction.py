@@ -208,17 +208,16 @@ def correct(
 
 
 def warn_of_wrong(
-    predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, in_tree: NDArray[Any], model: Any
+    predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, motion: Dynamic
 ) -> None:
     """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
 
     Each tree of bodies counts by itself, as an object may be much lighter than the robot.
 
     They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
-    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv), and in_tree
-    (nv, n_trees) says which degree of freedom belongs to which tree.
+    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
     """
-    mass = np.linalg.inv(inverse_mass)
+    mass, model, in_tree = np.linalg.inv(inverse_mass), motion.model, motion.in_tree
 
     def size(moved: Array) -> Array:
         """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""

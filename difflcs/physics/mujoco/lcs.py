@@ -386,8 +386,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     balanced = u + _find_balance(step, some, to[0], alone[0], (high - low).numpy())
     more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
     at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
-    bodies = step.velocity[some], read.moved.inverse_mass[some], of._motion.in_tree, of._model
-    warn_of_wrong(at[0], to[0], alone, *bodies)
+    warn_of_wrong(at[0], to[0], alone, step.velocity[some], read.moved.inverse_mass[some], step.motion)
 
 
 def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,7 +3,8 @@
 In a row J of a contact with depth r, velocity v and acceleration a, MuJoCo's force is (k d r − b v − a)/R. Its R comes
 from the inertia of the bodies in the model's initial state. Where A = J M⁻¹ Jᵀ is far smaller, as along a normal across
 the rail of a drawer, or of a finger that lies inside the hand near its axis, the force is that of a spring and damper,
-whatever moves, and friction has what it presses. These contacts have this force and compliance in a step.
+whatever moves, and friction has what it presses. These contacts have this force in a step, and friction the compliance
+R/b, less than this where the step ends before it has yielded so far, which takes about 1/b.
 """
 
 from typing import Any, NamedTuple
@@ -80,10 +81,10 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
             of_normal, of_tangent = data.efc_R[row], data.efc_R[row + (contact.dim > 1)]
             if edges:
                 of_normal, of_tangent = of_normal / edges, of_normal / (2 * contact.friction[0] ** 2)
-            stiffness, damping, impedance = data.efc_KBIP[row, :3]
+            stiffness, damping, impedance = np.maximum(data.efc_KBIP[row, :3], 1e-9)
             depth = data.efc_margin[row] - data.efc_pos[row]
             share = mine * (of_normal > _SOFT * moves[i]) / mine.sum()
-            firm[i] += share * damping / of_tangent
+            firm[i] += share * damping / -np.expm1(-damping * at.step.seconds) / of_tangent
             force[i] += share * stiffness * impedance * depth / of_normal
     soft &= force > 0
     compliance = np.clip(2 * contacts.friction**2 / np.maximum(at.give * firm, 1e-99), _LEAST, _MOST)
