@@ -37,7 +37,7 @@ constexpr int64_t kNear = 2;
 // that agree so are spared the local search. Starts after the first kFixed are left where they seem not to come below the
 // best cost by this part of it. A start of problems that are solved one by one costs as much as the first: of theirs half
 // are enough, whatever the number of actions, and the local search ends with the first round in vain, unless contacts are
-// sought at last.
+// sought for long at last.
 constexpr int64_t kHalf = 8, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
 constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
@@ -91,8 +91,9 @@ constexpr int64_t kLong = 48, kFewVaried = 4, kSoftest = kVaried + 1;
 // After all groups contacts are sought round the best plan, kVaried at a time: the actions close a gap over at most
 // the part kHeld of the horizon, and in kOpened of the cases they open it. The part kMeltedSeeks begins at softer
 // contact, as pulses do. A gain of kGain begins the count of rounds in vain anew, up to kMostSeeks times as many in all.
+// Round a plan that kRefined starts of a group have found the local search seeks contacts, too, instead of drawing.
 constexpr double kHeld = 0.4, kOpened = 0.3, kMeltedSeeks = 0.7;
-constexpr int64_t kMostSeeks = 4;
+constexpr int64_t kMostSeeks = 4, kRefined = 2;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
@@ -434,10 +435,11 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     const auto done = [&](int64_t e) { return agreed[e] >= kAgreed || found[e] >= effort.sure; };
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
-  if (effort.seeks == 0) return;
-  live.resize(count);
-  std::iota(live.begin(), live.end(), 0);
-  patience.assign(count, effort.seeks);
+  live.clear();
+  for (int64_t e = 0; e < count; e++) {
+    patience[e] = std::min(effort.seeks, effort.sure - found[e]);
+    if (patience[e] > 0) live.push_back(e);
+  }
   improve(batch, effort, to, runner, first, count, true);
 }
 
@@ -448,7 +450,7 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   const Sizes n(batch);
   const MpcPlans out = grouped.plans();
   const bool guessed = guess.u && start == 0, whole = guess.lam;  // by actions alone, or by forces too
-  const bool brief = large(batch) && effort.seeks == 0;
+  const bool brief = large(batch) && effort.seeks < kRounds;
   const int64_t starts = effort.starts, least = brief ? kHalf : kHalf * batch.n_u;
   const int64_t half = starts < kVaried ? starts : std::max(least, starts / 2);
   const int64_t shift = guess.u ? 1 : 0;
@@ -634,12 +636,11 @@ void MpcSearch::harden(const MpcBatch& batch, const MpcEffort& effort, const Mpc
   }
 }
 
-// Sets the first actions of a job to those of a plan, varied. `again`: the plan has been shifted in vain.
-void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan,
+// Sets the first actions of a job to those of a plan, shifted or varied otherwise.
+void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool shifted, const double* plan,
                      int64_t job) {
   const auto random = [&](int64_t i) { return uniform(effort.seed, -1 - kind, i); };
   const int64_t horizon = batch.horizon, n_u = batch.n_u, drawn = batch.horizon * batch.n_u;
-  const bool shifted = kind / kVaried % kRounds == 0 && !again;
   const bool melted = !shifted && kind % 2 == 1, moved = !shifted && kind % 4 == 2, pushed = !shifted && kind % 4 == 0;
   const Shift shift = shifted ? kShifts[kind % kVaried] : Shift{Shift::all, 0};
   int64_t begin = shift.part == Shift::end ? horizon / 2 : 0, later = shift.later;
@@ -726,10 +727,12 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.start[j].needed = needed(out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
-      if (seeking)
+      const bool shifted = kind / kVaried % kRounds == 0 && idle[e] < kRounds;  // again, it would be in vain
+      const bool refined = !few && !shifted && effort.seeks > 0 && ended[e] >= kRefined;
+      if (seeking || refined)
         seek(batch, effort, kind, out.u + e * n.u, j);
       else
-        vary(batch, effort, kind, idle[e] >= kRounds, out.u + e * n.u, j);
+        vary(batch, effort, kind, shifted, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {

@@ -15,8 +15,8 @@ constexpr int64_t kVaried = 8;  // variations of a plan at a time
 struct MpcEffort {
   int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
   int64_t groups;   // in which they are searched one after the other; at least one
-  int64_t sure;     // an element for which so many starts have found its best plan has no further group
-  int64_t seeks;    // rounds in vain that end the search for other contacts; 0: no such search
+  int64_t sure;     // an element has no further group, and seeks nothing, once so many starts have found its best plan
+  int64_t seeks;    // rounds in vain that end the search for other contacts, or as many as starts are missing; 0: none
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
@@ -107,7 +107,7 @@ class MpcSearch {
               int64_t count);
   bool apart(const MpcBatch& batch, int64_t job, const double* u) const;
   bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
-  void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool again, const double* plan, int64_t job);
+  void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, bool shifted, const double* plan, int64_t job);
   void seek(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job);
   void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
                int64_t count, bool seeking);

@@ -179,24 +179,16 @@ def test_the_search_ends_after_half_the_starts_where_most_of_them_agree():
     assert bool((groups.objective <= group.objective * (1 + 1e-9)).all())
 
 
-def test_another_group_of_starts_follows_where_few_of_them_find_the_plan(build):
-    """Where three of four do, that is all."""
-    x0, goal = data(build, 64)
-    one, more = (pushing(build, 5, **options)(x0, goal) for options in ({"restarts": 4}, {}))
-    unsure = more.iterations > one.iterations
-    assert 10 <= int(unsure.sum()) <= 54
-    assert torch.equal(one.u[~unsure], more.u[~unsure])
-    assert bool((more.objective <= one.objective).all())
-    assert bool((more.objective < 0.999 * one.objective).any())
-
-
-def test_contacts_are_sought_round_the_best_plan():
-    """Two carts: 96 starts lack a gentle hit. They find the best plans of nearly all states but these."""
+def test_contacts_are_sought_round_the_best_plan(build):
+    """Pushing: where three of four starts find it, that is all. Two carts: here 96 starts lack a gentle hit."""
+    one, more = (pushing(build, 5, **options)(*data(build, 64)) for options in ({"restarts": 4}, {}))
+    assert 10 <= int((more.u == one.u).flatten(1).all(1).sum()) <= 60
     mpc = LCSMPCLayer(chain_of_carts(2), push_the_last_cart(2, 50), 50, -2.0, 2.0)
     x0 = uniform([0.3, 0.1, 0.5, 0.2], 192, 1)[[64, 56, 107]]
     starts, seeks = (costs(mpc, x0, **options) for options in ({"restarts": 96}, {"effort": "best"}))
-    assert bool((seeks <= starts).all())
-    assert bool((seeks < 0.99 * starts).any())
+    for before, after, gain in ((one.objective, more.objective, 1e-3), (starts, seeks, 1e-2)):
+        assert bool((after <= before).all())
+        assert bool((after < (1 - gain) * before).any())
 
 
 def test_a_plan_that_creeps_along_kinks_is_not_lost():
@@ -268,12 +260,12 @@ def test_plans_of_many_contacts_get_more_starts():
         efforts = [options] if options else [{"effort": effort} for effort in ("fast", "default", "best")]
         return [BatchedBackend(**one).starts(problem, guessed)[:2] for one in efforts]
 
-    assert starts(5, 8, guessed=False) == [(1, 1), (16, 4), (64, 4)]
+    assert starts(5, 8, guessed=False) == [(1, 1), (4, 1), (64, 4)]
     assert starts(5, 8, guessed=True) == [(1, 1), (1, 1), (64, 4)]
     assert starts(20, 5, guessed=False) == [(3, 1), (32, 2), (96, 6)]
     assert starts(20, 5, guessed=True) == [(1, 1), (1, 1), (96, 6)]
     assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [(3, 1), (32, 2), (96, 6)]
-    assert starts(10, 5, guessed=False, n_u=3) == [(1, 1), (16, 4), (64, 4)]
+    assert starts(10, 5, guessed=False, n_u=3) == [(1, 1), (4, 1), (64, 4)]
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [(5, 1)]
 
 

@@ -25,8 +25,8 @@ class Starts(NamedTuple):
     Attributes:
         starts: the number of all.
         groups: in which they are tried one after the other.
-        sure: an element has no further group once so many starts have found its best plan.
-        seeks: rounds in vain that end the search for other contacts; 0: no such search.
+        sure: an element has no further group, and seeks nothing, once so many starts have found its best plan.
+        seeks: rounds in vain that end the search for other contacts; fewer where fewer starts are missing to `sure`.
     """
 
     starts: int
@@ -37,7 +37,7 @@ class Starts(NamedTuple):
 
 _STARTS = {
     "fast": (Starts(1, 1, 1), Starts(3, 1, 1)),
-    "default": (Starts(16, 4, 3), Starts(32, 2, 1)),
+    "default": (Starts(4, 1, 3, 3), Starts(32, 2, 1, 1)),
     "best": (Starts(64, 4, 4), Starts(96, 6, 96, 24)),
 }
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
@@ -79,20 +79,19 @@ class BatchedBackend(Backend):
     part of it is shifted in time, pushed, or solved again from softer contact, until that finds nothing better, longer
     for long plans. Large problems (n_lam of 40 or more, or n_x + n_u of 48) are solved one by one, and their starts are
     not shared out on lanes: half of them are enough for any number of actions, and one round in vain ends the local
-    search. Of four to seven starts only four of these are tried. Another group of starts is searched so where
-    few have found the best plan; that of all groups counts. Where many contacts are possible, "best" seeks others round
-    it: the actions of a start close or open the gap of one contact for some stages as far as they can, and most such
-    starts begin at softer contact.
+    search. Of four to seven starts only four of these are tried. Where few starts have found the best plan, another
+    group is searched so, and "default", as "best" where many contacts are possible, seeks contacts round it: the
+    actions of a start close or open one gap for some stages as far as they can; most such starts begin softer.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", up to four groups of four; "best", up to four of sixteen; 3, 2 × 16 and
-            6 × 16 where horizon × n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have many
-            optima. There "best" seeks contacts until 24 rounds of eight starts find nothing better. A guess is the
-            first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
+        effort: "fast", one start; "default", four, and three rounds of eight in vain that seek contacts; "best", up to
+            four groups of sixteen; 3, 2 × 16 with one round and 6 × 16 with 24 where horizon × n_lam is 100 or more, or
+            20 times n_u, or the horizon 40, as such plans have many optima. A guess is the first start, and the only
+            one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search,
             from 32 on in groups of sixteen until five end with the same plan.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
