@@ -78,7 +78,7 @@ class Linearisation {
     const auto F = data.F;
     const auto C = data.C;
     const LowRank& low_rank = problem.low_rank[k];
-    const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank && !low_rank.skewed();
+    const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
       a[i] = s[i] * stage.size[i];
@@ -105,7 +105,7 @@ class Linearisation {
     // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
     for (int64_t i = 0; i < nl; i++) stage.y[i] = all(0) - C.column(i) * p;
     if (short_cut)
-      low_rank.solve_right(stage.y);
+      low_rank.solve_transposed(stage.y);
     else
       lu.solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
     // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].

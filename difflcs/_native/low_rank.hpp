@@ -69,8 +69,7 @@ class LowRank {
   // Whether F is of this kind.
   explicit operator bool() const { return rank > 0; }
   // Whether it is not, of so many forces that they are always alone: some differ much in size from others.
-  bool unlike() const { return most > 0 && (rank == 0 || skewed()) && n >= kAloneForces; }
-  bool skewed() const { return skew_count > 0; }
+  bool unlike() const { return most > 0 && (rank == 0 || skew_count > 0) && n >= kAloneForces; }
 
   // Looks whether system k is of this kind.
   template <class Square, class Wide>
@@ -126,8 +125,8 @@ class LowRank {
     for (int64_t c = 0; c < skew_count; c++) g[skew[c]] = moved[skew_first + c];
   }
 
-  // g becomes (diag(a) + F diag(b))^-1 g, where it has as many columns as V holds. Not of a skewed F: what is lost to
-  // rounding there only makes a step of `solve`'s caller worse, which looks at the residual.
+  // g becomes (diag(a) + F diag(b))^-1 g, where it has as many columns as V holds. With z for this, b z is the x of
+  // diag(b) g above.
   template <class V = Vec>
   void solve_right(V* g) const {
     Local<0, V> forces(right);
@@ -137,6 +136,21 @@ class LowRank {
     }
     const Local<0, V> moved = feel(forces);
     multiply(W, moved, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { g[i] = g[i] - inverse[i] * sum; });
+    if (skew_count > 0)
+      for (int64_t i = 0; i < n; i++) forces[i] = b[i] * g[i];
+    for (int64_t c = 0; c < skew_count; c++) {  // not x_t / b_t, as b_t may be tiny
+      V sum = V{} + W_t.row(skew_first + c) * forces;
+      for (int64_t m = 0; m < skew_count; m++)
+        if (m != c) sum = sum - F[skew[c] * n + skew[m]] * moved[skew_first + m];
+      g[skew[c]] += inverse[skew[c]] * sum;
+    }
+  }
+
+  // g becomes (diag(a) + F^T diag(b))^-1 g.
+  void solve_transposed(Vec* g) const {
+    reverse(g);
+    solve_right(g);
+    reverse(g);
   }
 
   // to = q + F x, by columns.

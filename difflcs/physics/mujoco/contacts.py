@@ -199,22 +199,20 @@ class ContactFinder:
         size = np.minimum(model.geom_rbound[first], model.geom_rbound[second])
         rough = np.repeat([budget.friction for budget in budgets], [len(mine) for mine in of])
         rubs = np.where(self._rubs[first, second] & rough, self._margin[first, second], -np.inf)
+        geoms = np.where(kind == PLANE, np.inf, model.geom_rbound), kind, model.body_rootid[model.geom_bodyid], number
+        friction, spin = self.friction[first, second] * rough, self._spin[first, second]
+        pairs = first, second, formula, boxes, meet, size, friction, spin, rubs
         fields = {
             "nq": model.nq,
             "nv": model.nv,
             "plane": PLANE,
             "tangents": self.n_tangents,
             "axis": [] if self.axis is None else self.axis.tolist(),
-            "radius": np.where(kind == PLANE, np.inf, model.geom_rbound),
+            "geoms": list(zip(*(v.tolist() for v in geoms), strict=True)),
             "box": model.geom_aabb.reshape(-1, 6).copy(),
-            "kind": kind.astype(np.int64),
-            "root": model.body_rootid[model.geom_bodyid].astype(np.int64),
-            "solid": number.astype(np.int64),
             "moves": find_moving(model)[model.geom_bodyid],
             "solids": [describe_solid(model, int(geom)) for geom in solids],
-            "geoms": np.stack([first, second], -1).astype(np.int64),
-            "flags": np.stack([formula, boxes, meet], -1),
-            "numbers": np.stack([size, self.friction[first, second] * rough, self._spin[first, second], rubs], -1),
+            "pairs": list(zip(*(v.tolist() for v in pairs), strict=True)),
             "groups": groups,
         }
         return _mujoco.Scene(fields)

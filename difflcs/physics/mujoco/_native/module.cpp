@@ -69,38 +69,25 @@ Scene make_scene(const nb::dict& f) {
   const auto axis = value<std::vector<double>>(f, "axis");
   s.planar = !axis.empty();
   if (s.planar) s.axis = load(axis.data());
-  const auto radius = value<Array<const double>>(f, "radius"), box = value<Array<const double>>(f, "box");
-  const auto kind = value<Array<const int64_t>>(f, "kind"), root = value<Array<const int64_t>>(f, "root");
-  const auto solid = value<Array<const int64_t>>(f, "solid");
+  const auto box = value<Array<const double>>(f, "box");
   const auto moves = value<Array<const bool>>(f, "moves");
-  s.ngeom = static_cast<int>(radius.shape(0));
-  for (int g = 0; g < s.ngeom; g++) {
+  for (const auto& [radius, kind, root, solid] : value<std::vector<std::tuple<double, int, int, int>>>(f, "geoms")) {
+    const size_t g = s.geoms.size();
     const double* around = box.data() + 6 * g;
-    const bool* row = moves.data() + static_cast<int64_t>(s.nv) * g;
-    s.geoms.push_back({radius.data()[g],
-                       static_cast<int>(kind.data()[g]),
-                       static_cast<int>(root.data()[g]),
-                       load(around),
-                       load(around + 3),
-                       static_cast<int>(solid.data()[g]),
-                       {row, row + s.nv}});
+    const bool* row = moves.data() + s.nv * g;
+    s.geoms.push_back({radius, kind, root, load(around), load(around + 3), solid, {row, row + s.nv}});
   }
+  s.ngeom = static_cast<int>(s.geoms.size());
   for (nb::handle each : value<nb::list>(f, "solids")) {
     const auto fields = nb::cast<nb::dict>(each);
     s.solids.push_back({value<bool>(fields, "round"), value<double>(fields, "cap"), value<double>(fields, "radius"),
                         value<double>(fields, "half"), value<std::vector<int>>(fields, "counts"),
                         value<std::vector<double>>(fields, "corners"), value<std::vector<double>>(fields, "outward")});
   }
-  const auto geoms = value<Array<const int64_t>>(f, "geoms");
-  const auto flags = value<Array<const bool>>(f, "flags");
-  const auto numbers = value<Array<const double>>(f, "numbers");
-  for (size_t p = 0; p < geoms.shape(0); p++) {
-    const int64_t* of = geoms.data() + 2 * p;
-    const bool* flag = flags.data() + 3 * p;
-    const double* number = numbers.data() + 4 * p;
-    s.pairs.push_back({static_cast<int>(of[0]), static_cast<int>(of[1]), flag[0], flag[1], flag[2],
-                       number[0], number[1], number[2], number[3]});
-  }
+  using Constants = std::tuple<int, int, bool, bool, bool, double, double, double, double>;
+  for (const auto& [first, second, formula, boxes, faces, size, friction, spin, rubs] :
+       value<std::vector<Constants>>(f, "pairs"))
+    s.pairs.push_back({first, second, formula, boxes, faces, size, friction, spin, rubs});
   for (const auto& [begin, end, count, distance] : value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
     s.groups.push_back({begin, end, count, distance});
   return s;
