@@ -24,7 +24,7 @@ from difflcs.errors import ContactWarning, InvalidInputError, warn
 from difflcs.lcp import solve_lcp
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import Rows
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
+from difflcs.physics.mujoco.motion import FAST_MOTION, Dynamic, DynamicStep, Linearised
 from difflcs.physics.mujoco.native import flags
 from difflcs.physics.mujoco.nominal import solve_forces
 from difflcs.physics.mujoco.state import MujocoState
@@ -74,6 +74,7 @@ class WholeStep:
         motion, nv = self._motion, self.model.nv
         ctrl = read.nominal + x[:, :nv] @ motion.moment.T
         after = self.simulate(places, states, ctrl)
+        after[read.unstable & (np.abs(after).max(1) > FAST_MOTION)] = np.nan  # unstable steps may lead anywhere
         if (held := (np.abs(read.reached - after)[:, :nv] > _APART).any(1)).any():
             again = motion.read_by(self._native, places, states[held], ctrl[held])
             again.unstable[:] = motion.find_unstable(again)

@@ -36,7 +36,7 @@ from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_respon
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
-_FAST_MOTION = 100.0  # a motion in a step [m, rad] or velocity that may be that of unstable steps
+FAST_MOTION = 100.0  # a motion in a step [m, rad] or velocity that may be that of unstable steps
 _FINER = 4  # how many steps for one of MuJoCo's where these are unstable
 _LONGEST = 100_000  # time steps in one step of the system, far more than any plan is for
 _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
@@ -148,7 +148,7 @@ class Dynamic:
         """
         after = np.full((len(states), 2 * self.model.nv + self.model.na), np.inf)
         for steps, some in ((self.simulated, ~unstable), (self.finer, None)):
-            some = ~(np.abs(after).max(1) < _FAST_MOTION) if some is None else some
+            some = ~(np.abs(after).max(1) < FAST_MOTION) if some is None else some
             if some.any():
                 after[some] = self.run(self._native(steps, loose), places, states[some], ctrl[some])
         return after
