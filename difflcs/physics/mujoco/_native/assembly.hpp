@@ -40,7 +40,7 @@ inline bool is_positive(double* M, int n, double shift) {
   return true;
 }
 
-// Writes the matrices of a state, zero before; false where only their numbers can say that all are finite, F + Fᵀ positive definite.
+// Writes the matrices of a state, zero before; false where only their numbers say whether they are finite, F + Fᵀ ≻ 0.
 DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
   const int nv = s.nv, nx = s.nx, rays = s.contacts * s.each(), m = s.rows(), all = s.forces(), first = m - s.bounded;
   std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), along(nv), effect(nx), transposed(nv * nx);
