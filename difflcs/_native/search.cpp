@@ -19,7 +19,7 @@ struct Start {
   int64_t explore;              // Newton steps at the target of the homotopy after which it is compared
 };
 
-// The sequence of starts; docs/theory.md says what each may find. A start at the target needs more steps before its
+// The sequence of starts; docs/search.md says what each may find. A start at the target needs more steps before its
 // objective can be compared. For a single problem these are free while its first start is under way.
 constexpr int64_t kExplore = 2, kExploreFar = 6, kFixed = 4;
 Start start_of(int64_t i) {
