@@ -60,7 +60,7 @@ def run_page(page: Path, code: list[str], folder: Path) -> None:
 SHORTER = {
     "fit.md": {"in (0, 2, 3, 5)": "in (0, 5)", "in range(3)]": "in range(1)]"},
     "own_system.md": {"minutes=2.0": "minutes=1.3"},
-    "physics_mujoco.md": {"in range(150)": "in range(100)"},
+    "identify.md": {"in range(150)": "in range(100)"},
     "rl_stacks.md": {"n_trials=2": "n_trials=1", "in (0, 1))": "in (0,))"},
 }
 """Page → what takes long there, and what is run instead."""
