@@ -1,13 +1,11 @@
-"""Gradients of small networks and Adam written by hand: the same as autograd's and torch's."""
+"""Gradients of small networks written by hand: the same as autograd's."""
 
-import copy
 from itertools import pairwise
 
 import pytest
 import torch
-from torch import nn
 
-from difflcs.rl.learning.least_squares import BACKWARD, FlatAdam, gradients, tanh
+from difflcs.rl.learning.least_squares import BACKWARD, gradients, tanh
 
 REFERENCE = {torch.relu_: torch.relu, tanh: torch.tanh}
 
@@ -46,18 +44,3 @@ def test_tanh_is_that_of_torch():
     x = torch.linspace(-20, 20, 4001)
     torch.testing.assert_close(tanh(x), torch.tanh(x), rtol=0, atol=3e-7)
     assert torch.equal(x, torch.linspace(-20, 20, 4001))
-
-
-def test_flat_adam_is_adamw():
-    torch.manual_seed(0)
-    module = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1))
-    twin = copy.deepcopy(module)
-    mine, theirs = FlatAdam(module, 1e-2), torch.optim.AdamW(twin.parameters(), weight_decay=1e-2)
-    for step in range(20):
-        theirs.param_groups[0]["lr"] = size = 0.1 / (step + 1)
-        for k, p in enumerate(twin.parameters()):
-            p.grad = drawn(*p.shape, seed=100 * step + k)
-        theirs.step()
-        mine.step(torch.cat([p.grad.flatten() for p in twin.parameters()]), size)
-    for a, b in zip(module.parameters(), twin.parameters(), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)

@@ -101,7 +101,7 @@ class Critic:
                 for batch in torch.randperm(len(x)).split(minibatch):
                     _, layer_gradients = gradients(layers, tanh, x[batch].unsqueeze(0), y[batch].view(1, -1, 1))
                     parts = [part for weight, bias in layer_gradients for part in (weight.mT.flatten(), bias.flatten())]
-                    self._adam.step(torch.cat(parts), _LEARNING_RATE * (1 - done / steps))
+                    self._adam.descend(torch.cat(parts), _LEARNING_RATE * (1 - done / steps))
                     done += 1
 
     def state_dict(self) -> dict[str, Any]:

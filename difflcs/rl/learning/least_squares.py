@@ -6,12 +6,11 @@ ensemble of four with two hidden layers of 128, 4 times for a value network of 6
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from difflcs.rl.learning.state_tree import State
+from difflcs.rl.learning.state_tree import StatefulAdam
 
 Layer = tuple[Tensor, Tensor]
 """Weights (K, n_in, n_out) and biases (K, 1, n_out) of one layer of K networks."""
@@ -58,42 +57,22 @@ def gradients(
     return errors.square_().mean((1, 2)), layer_gradients[::-1]
 
 
-class FlatAdam:
-    """AdamW on the parameters of a module, which become views of one vector; the gradient comes as a vector too.
-
-    Loshchilov and Hutter, "Decoupled weight decay regularization", 2019, with the averaging factors of torch.
+class FlatAdam(StatefulAdam):
+    """AdamW on the parameters of a module, which become views of one vector: a step takes half the time of one on each.
 
     Args:
         module: the module to train.
         weight_decay: part of the parameters that a step of size one takes away.
     """
 
-    _BETAS, _EPS = (0.9, 0.999), 1e-8
-
     def __init__(self, module: nn.Module, weight_decay: float):
         parameters = list(module.parameters())
         self.vector = nn.utils.parameters_to_vector(parameters).detach()
         for p, part in zip(parameters, self.vector.split([p.numel() for p in parameters]), strict=True):
             p.data = part.view_as(p)
-        self.weight_decay, self.steps = weight_decay, 0
-        self.average, self.square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
+        super().__init__([self.vector], 0.0, weight_decay, fused=True)
 
-    def step(self, gradient: Tensor, size: float) -> None:
+    def descend(self, gradient: Tensor, size: float) -> None:
         """Take a step of this size against the gradient (P,)."""
-        self.steps += 1
-        first, second = self._BETAS
-        self.vector.mul_(1 - size * self.weight_decay)
-        self.average.lerp_(gradient, 1 - first)
-        self.square.mul_(second).addcmul_(gradient, gradient, value=1 - second)
-        scale = (self.square / (1 - second**self.steps)).sqrt_().add_(self._EPS)
-        self.vector.addcdiv_(self.average, scale, value=-size / (1 - first**self.steps))
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of the optimiser, without the parameters."""
-        return {"steps": self.steps, "average": self.average, "square": self.square}
-
-    def load_state_dict(self, state: State) -> None:
-        """Go on from what `state_dict` gave."""
-        self.steps = state["steps"]
-        self.average.copy_(state["average"])
-        self.square.copy_(state["square"])
+        self.vector.grad, self.param_groups[0]["lr"] = gradient, size
+        self.step()
