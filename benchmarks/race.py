@@ -22,7 +22,6 @@ from race_hard import measure, tune
 from race_problems import RELAXATION, as_mpc, hard_cost, small, with_contact, without_contact
 from rivals.problem import Problem
 
-from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
@@ -228,31 +227,6 @@ def _sensitivity(mpc: MPCProblem, linear: kkt.Linearisation, weight: np.ndarray)
     return kkt.vjp(mpc, linear, (x, u, lam, torch.zeros(mpc.batch, dtype=torch.float64)), every)["x0"]
 
 
-def finite_differences(problem: Problem, step: float = 1e-6) -> float:
-    """Compare the layer's gradient with central differences of its plan, warm-started: median relative difference."""
-    mpc = as_mpc(problem, min(32, problem.count))
-    lcs = LCSParams(**{name: getattr(mpc, name) for name in ("A", "B", "C", "d", "D", "E", "F", "c")})
-    cost = QuadraticCost(**{name: getattr(mpc, name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")})
-    layer = LCSMPCLayer(lcs, cost, mpc.horizon, mpc.u_min, mpc.u_max, relaxation=mpc.relaxation, on_failure="mask")
-    weight = torch.from_numpy(problem.weight)
-    x0 = mpc.x0.clone().requires_grad_()
-    plan = layer(x0)
-    (plan.u[:, 0] @ weight).sum().backward()
-    assert x0.grad is not None
-    quotient = torch.zeros_like(x0)
-    with torch.no_grad():
-        guess = layer(mpc.x0)
-        for k in range(mpc.n_x):
-            e = step * torch.eye(mpc.n_x, dtype=torch.float64)[k]
-            ends = [layer(mpc.x0 + sign * e, guess=guess).u[:, 0] @ weight for sign in (1, -1)]
-            quotient[:, k] = (ends[0] - ends[1]) / (2 * step)
-    size = quotient.norm(dim=1)
-    moving = plan.converged & (size > 1e-6)
-    if not bool(moving.any()):
-        return 0.0
-    return float(((x0.grad - quotient).norm(dim=1) / size)[moving].median())
-
-
 # --- the race ---------------------------------------------------------------------------------------------------------
 
 
@@ -382,11 +356,9 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
             families[family] = summary([run(problem, processes, o, folder) for problem in members])
             for label, row in families[family].items():
                 print(f"{family:20s} {label:24s} {row.get('error') or row['ratio'][0]}", flush=True)
-        differences = {family: finite_differences(members[0]) for family, members in problems.items()}
         for process in processes:
             process.close()
     yield name, families
-    yield f"{name}, finite differences", differences
     yield f"{name}, best rival", best_rival(families)
     yield f"{name}, versions", {p.entry.label: p.version for p in processes if not p.missing}
     yield f"{name}, missing", {p.entry.label: p.missing for p in processes if p.missing}

@@ -99,8 +99,6 @@ def gradients(part: str) -> Callable[[dict], str]:
                 own = f", {duration(row['with_gradient'])}" if "with_gradient" in row else ""
                 cells.append("—" if error is None else f"{error:.0e}{own}")
             rows.append([label, *cells])
-        differences = record["results"][f"{part}, finite differences"]
-        rows.append(["`batched` against differences", *(f"{differences[name]:.0e}" for name in families)])
         return table(["", *families], rows)
 
     return make

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from difflcs import LCSModel, _storage
-from difflcs.errors import CheckpointError, DiffLCSError, InUseError, InvalidInputError, MissingDependencyError
+from difflcs.errors import CheckpointError, InUseError, InvalidInputError, MissingDependencyError
 from difflcs.rl.learning.state_tree import check_state, copy_state, flatten, restore, unflatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from tests.conftest import contents, python, refuse
@@ -86,7 +86,8 @@ def _flip(path):
     path.write_bytes(bytes(data))
 
 
-def _edit(path, change):
+def _edit(folder, change):
+    path = folder / "config.json"
     record = json.loads(path.read_text())
     change(record)
     path.write_text(json.dumps(record))
@@ -99,10 +100,8 @@ CORRUPTIONS = {
     "latest leads outside": lambda root: (root / "latest.json").write_text('{"checkpoint": "../1"}'),
     "no directory": lambda root: shutil.rmtree(root / "000002"),
     "a flipped bit": lambda root: _flip(root / "000002/model.safetensors"),
-    "an edited counter": lambda root: _edit(
-        root / "000002/config.json", lambda r: r["config"]["state"].update(collected=99)
-    ),
-    "another kind": lambda root: _edit(root / "000002/config.json", lambda r: r.update(kind="LCSModel")),
+    "an edited counter": lambda root: _edit(root / "000002", lambda r: r["config"]["state"].update(collected=99)),
+    "another kind": lambda root: _edit(root / "000002", lambda r: r.update(kind="LCSModel")),
     "another iteration": lambda root: (
         (root / "000002").rename(root / "000009") and (root / "latest.json").write_text('{"checkpoint": "000009"}')
     ),
@@ -283,17 +282,11 @@ def test_every_single_change_is_refused_by_name(path, number):
         ("on", False),
         ("learned.parameters.A", torch.ones(2, 3)),
         ("random.noise.state.state", 2**127),
+        *(("episodes", {"state": torch.ones(n, 3, 2), "action": torch.ones(n, 2, 1)}) for n in (0, 9)),
     ],
 )
 def test_values_that_may_differ_do(path, value):
     check_state(make_tree(), changed(path, value))
-
-
-def test_episodes_are_any_number_of_rows_as_many_in_each():
-    more = changed("episodes", {"state": torch.ones(9, 3, 2), "action": torch.ones(9, 2, 1)})
-    check_state(make_tree(), more)
-    none = changed("episodes", {"state": torch.ones(0, 3, 2), "action": torch.ones(0, 2, 1)})
-    check_state(make_tree(), none)
 
 
 @pytest.mark.parametrize("found", [None, 3, [], "x"])
@@ -353,17 +346,6 @@ def saved(model, tmp_path):
     return tmp_path / "saved"
 
 
-def refuse_model(directory, match=None):
-    """Loading fails with the typed error, names the directory, and changes no file."""
-    before = contents(directory) if directory.is_dir() else None
-    with pytest.raises(CheckpointError, match=match) as error:
-        LCSModel.from_pretrained(directory)
-    assert str(directory) in str(error.value)
-    assert isinstance(error.value, DiffLCSError)
-    if before is not None:
-        assert contents(directory) == before
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("learn_c", [True, False])
 def test_round_trip_keeps_every_bit(build, tmp_path, dtype, learn_c):
@@ -385,30 +367,23 @@ def test_files_are_readable_by_others(saved):
         assert stat.S_IMODE(path.stat().st_mode) & 0o444 == 0o444
 
 
-@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
-def test_a_missing_file_is_refused(saved, name):
-    (saved / name).unlink()
-    refuse_model(saved, f"a file is missing.*{name}")
+NO_MODELS = {
+    "a file is missing.*config.json": lambda path: (path / "config.json").unlink(),
+    "a file is missing.*model.safetensors": lambda path: (path / "model.safetensors").unlink(),
+    "config.json": lambda path: (shutil.rmtree(path), path.write_text("hello")),  # a file in the place of the directory
+    "expected a record of kind 'LCSModel', got 'PDDM'": lambda path: _edit(path, lambda r: r.update(kind="PDDM")),
+    "expected a record of kind 'LCSModel', got None": lambda path: _edit(path, lambda r: r.update(kind=None)),
+    "expected format 1, got 2; update difflcs": lambda path: _edit(path, lambda r: r.update(format=2)),
+    "expected": lambda path: _edit(path, lambda r: r.update(config=[1])),
+}
 
 
-def test_a_file_in_the_place_of_the_directory_is_refused(tmp_path):
-    (tmp_path / "file").write_text("hello")
-    refuse_model(tmp_path / "file")
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"kind": "PDDM"}, "expected a record of kind 'LCSModel', got 'PDDM'"),
-        ({"kind": None}, "expected a record of kind 'LCSModel', got None"),
-        ({"format": 2}, "expected format 1, got 2; update difflcs"),
-        ({"config": [1]}, "expected"),
-    ],
-)
-def test_a_record_of_another_kind_or_format_is_refused(saved, change, match):
-    path = saved / "config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    refuse_model(saved, match)
+@pytest.mark.parametrize("match", NO_MODELS)
+def test_what_is_no_model_is_refused_by_its_directory_and_untouched(saved, match):
+    NO_MODELS[match](saved)
+    before = contents(saved)
+    assert str(saved) in refuse(CheckpointError, match, LCSModel.from_pretrained, saved)
+    assert contents(saved) == before
 
 
 @pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit, MemoryError])

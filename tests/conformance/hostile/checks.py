@@ -228,7 +228,7 @@ def _vertex(problem: Case, u, low, high) -> np.ndarray:
 
 
 def judge_relaxed_program(
-    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray
+    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, *rows: np.ndarray
 ) -> Ratios:
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import torch
 from numpy.random import Generator
 
 from difflcs import Status
@@ -16,7 +15,17 @@ from difflcs.errors import DiffLCSError
 from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.generators import by_name
-from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, promised, quiet, refused_one_by_one
+from tests.conformance.hostile.targets import (
+    REFUSED,
+    Outcome,
+    cold,
+    layer_of,
+    leaves_of,
+    quiet,
+    refused_one_by_one,
+    shift,
+    solve_mpc,
+)
 from tests.conformance.varied import programs
 from tests.conformance.varied.generators import random_case
 
@@ -164,45 +173,27 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Case:
     return form.changed(**a)
 
 
-def _solve(form: Case, warm: bool) -> Outcome:
-    leaves = leaves_of(form)
-    with quiet(), np.errstate(all="ignore"):
-        layer = layer_of(form, leaves)
-        guess = None
-        if warm:
-            with torch.no_grad():
-                guess = layer(leaves["x0"]).shift()
-        plan = layer(leaves["x0"], guess=guess)
-        (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.sum((-1, -2)) + plan.objective).sum().backward()
-        names = ("x", "u", "lam", "mu", "objective", "violation", "kkt_residual")
-        x, u, lam, mu, cost, violation, residual = (getattr(plan, k).detach().numpy() for k in names)
-        status = plan.status.numpy().astype(int)
-        ratios = _judge(form, status, x, u, lam, mu, cost, violation)
-    ratios["finite"] = checks.finite(x, u, lam, mu, cost, violation, residual)
-    grads = [leaf.grad.numpy() for leaf in leaves.values() if leaf.grad is not None]
-    ratios["finite gradient"] = checks.finite(*grads)
-    return Outcome(status, ratios)
-
-
-def _judge(form: Case, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
-    count, solved, case = form.count, (status == Status.CONVERGED) | (status == Status.DEGENERATE), form
+def judge(form: Case, *numbers: np.ndarray) -> checks.Ratios:
+    """Promises of a solution, and of a linear program its optimum."""
+    case = form
     if "price" in case.arrays:  # from 1e300 on a constraint is hard, see `Constraints`
         price = case.arrays["price"]
         case = case.changed(price=np.where(price >= 1e300, INF, price))
-    judged = checks.judge_mpc(case, x, u, lam, cost, mu, violation)
-    found = {**promised(judged, solved), "bounds": judged["bounds"]}
-    found["solved what is impossible"] = np.where(solved & form.impossible, INF, 0.0)
-    if lam.shape[-1] == 0:
-        wrong = (status == Status.INFEASIBLE) & form.possible
-        found["false INFEASIBLE of a convex program"] = np.where(wrong, INF, 0.0)
-        gaps = [programs.above_optimum(case, i, u[i]) if solved[i] else None for i in range(count)]
+    found = checks.judge_mpc(case, *numbers)
+    if not case.arrays["c"].size:
+        gaps = [programs.above_optimum(case, i, u) for i, u in enumerate(numbers[1])]
         found["optimum of a linear program"] = np.array([0.0 if gap is None else gap / 1e-6 for gap in gaps])
     return found
 
 
-def form_target(form: Case, rng: Generator, gradients: bool, warm: bool = False) -> Outcome:
-    """Solve, differentiate and judge."""
-    return refused_one_by_one(lambda part: _solve(part, warm), form)
+def form_target(form: Case, rng: Generator, gradients: bool, guess=cold) -> Outcome:
+    """Solve, differentiate and judge; also whether a status is true."""
+    done = refused_one_by_one(lambda part: solve_mpc(part, np.float64, "batched", guess, judge), form)
+    done.ratios["solved what is impossible"] = np.where(done.solved & form.impossible, INF, 0.0)
+    if not form.arrays["c"].size:
+        wrong = (done.status == Status.INFEASIBLE) & form.possible
+        done.ratios["false INFEASIBLE of a convex program"] = np.where(wrong, INF, 0.0)
+    return done
 
 
 def untouched(form: Case, rng: Generator, gradients: bool) -> Outcome:
@@ -240,4 +231,4 @@ FORM_CLASSES: dict[str, Callable[..., Case]] = by_name(
     plain, no_contact, zero_rows, opposite_rows, prices, limits, first_stage, not_numbers, extreme, vertex,
     prefix="form-",
 )  # fmt: skip
-FORM_TARGETS = {"batched": form_target, "warm": partial(form_target, warm=True), "untouched": untouched}
+FORM_TARGETS = {"batched": form_target, "warm": partial(form_target, guess=shift), "untouched": untouched}

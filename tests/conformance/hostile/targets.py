@@ -97,8 +97,9 @@ def _rounding(*pairs: tuple[torch.Tensor, torch.Tensor]) -> np.ndarray:
 
 
 def promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
-    """Conditions hold for solved elements; finite numbers for all."""
-    return {k: v if k in ("finite", "finite gradient") else np.where(solved, v, 0.0) for k, v in ratios.items()}
+    """Conditions hold for solved elements; finite numbers, and actions within their bounds, for all."""
+    of_all = ("finite", "finite gradient", "bounds")
+    return {k: v if k in of_all else np.where(solved, v, 0.0) for k, v in ratios.items()}
 
 
 # ---- solve_lcp ------------------------------------------------------------------------------------------------------
@@ -231,21 +232,22 @@ def leaves_of(problem: Case) -> dict[str, torch.Tensor]:
     return {k: torch.from_numpy(np.array(problem.arrays[k])).requires_grad_() for k in INPUTS if k in problem.arrays}
 
 
-def _mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
+def solve_mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
+    """Plan, differentiate and judge."""
     leaves = leaves_of(problem)
-    with quiet():
+    with quiet(), np.errstate(all="ignore"):
         layer = layer_of(problem, leaves, backend)
         plan = layer(leaves["x0"], guess=guess(problem, layer, leaves["x0"]))
-        (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.mean((-1, -2)) + plan.objective).sum().backward()
+        (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.sum((-1, -2)) + plan.objective).sum().backward()
         judged, wide = plan, problem.cast(np.float64)
         if dtype != np.float64:
             doubles = leaves_of(wide)
             judged = layer_of(wide, doubles, backend)(doubles["x0"])
-    names, status = ("x", "u", "lam", "objective"), plan.status.numpy().astype(int)
+    names, status = ("x", "u", "lam", "objective", "mu", "violation"), plan.status.numpy().astype(int)
     ratios = judge(wide, *(_numpy(getattr(judged, k)) for k in names))
     ratios["finite"] = checks.finite(*(_numpy(getattr(plan, k)) for k in (*names, "kkt_residual")))
     # Bounds are rounded inwards, or to their neighbours where that crosses.
-    low, high = (wide.full()[k][:, None] for k in ("u_min", "u_max"))
+    low, high = (checks.by_stage(wide)[k] for k in ("u_min", "u_max"))
     inner_low, inner_high = low.astype(dtype), high.astype(dtype)
     inner_low = np.where(inner_low < low, np.nextafter(inner_low, dtype(np.inf)), inner_low)
     inner_high = np.where(inner_high > high, np.nextafter(inner_high, dtype(-np.inf)), inner_high)
@@ -262,7 +264,7 @@ def _mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
         else:
             gradient = np.maximum(gradient, checks.finite(leaf.grad.numpy()))
     if shared_bad and not gradient.any():
-        again = lambda part: _mpc(part, dtype, backend, guess, judge)  # noqa: E731
+        again = lambda part: solve_mpc(part, dtype, backend, guess, judge)  # noqa: E731
         gradient = _who(lambda part: part.each(), again, problem)
     ratios["finite gradient"] = gradient
     outcome = Outcome(status, ratios)
@@ -314,7 +316,7 @@ def mpc_target(
         problem = replace(problem, barrier=barrier * float(rng.choice([1.0, 0.1, 10.0])))
     problem = _castable(problem, dtype)
     chosen = interior if guess is opposite and rng.random() < 0.3 else guess
-    done = refused_one_by_one(lambda part: _mpc(part, dtype, backend, chosen, judge), problem)
+    done = refused_one_by_one(lambda part: solve_mpc(part, dtype, backend, chosen, judge), problem)
     if gradients and dtype == np.float64 and backend != "relaxed":
         low, high = problem.full()["u_min"], problem.full()["u_max"]
         # Gradients are promised for inputs between 1e-30 and 1e30 only.
