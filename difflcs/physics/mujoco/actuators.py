@@ -235,6 +235,8 @@ class Actuators:
         """
         fields = {name: getattr(simulated, name) for name in ("nq", "nv", "nu", "na")}
         fields |= {"simulated": simulated._address, "linearised": (linearised or simulated)._address}
+        free = flags("CONTACT", "CONSTRAINT") & simulated.opt.disableflags
+        fields["held"] = linearised is not None and not free
         low, high = self.range
         arrays = {"gain": self.gain, "constant": self.constant, "bias": self.bias, "low": low, "high": high}
         arrays |= {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}

@@ -31,16 +31,20 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
+_NEAR = 1e-9  # [m, rad] to a state from which a step is as good as the same
 _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
 _FARTHER = 0.4  # of the speed before and of what forces do, by which an error is more than that of standing still
 _JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
+_MOST = 1e99  # a velocity whose square is a number
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
+_CREEP = 0.01  # [m/s, rad/s], a speed at which rounding moves what touches in many points
 _NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
 _HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
 _NEARLY = 0.005  # of the median change with all actions: an error that is none
 _APART = 0.5  # [rad, m] in a step, by which joints go farther without constraints
+_JUMPS = 0.1  # of the velocity of a tree, by which MuJoCo's own step hangs on rounding
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -68,6 +72,23 @@ class WholeStep:
             return self._motion.run(self._native, places, states, ctrl)
         except InvalidInputError:  # the systems stand without a correction
             return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
+
+    def warn_of_jumps(self, places: Places, states: Array, ctrl: Array, before: Array, inverse_mass: Array) -> None:
+        """Warn where states next to these lead to other velocities, see `simulate`; `before` are those now (n, nv)."""
+        nv, near = self.model.nv, np.tile(states, (4, 1, 1))
+        near[1:, :, : self.model.nq] += _NEAR * np.random.default_rng(0).normal(size=(3, len(states), self.model.nq))
+        after = self.simulate(places, near.reshape(-1, states.shape[1]), np.tile(ctrl, (4, 1)))
+        after = after.reshape(4, len(states), -1)[..., nv : 2 * nv]
+        mass, in_tree = np.linalg.inv(inverse_mass), self._motion.in_tree
+        jumps, moves = (_size(v, mass, in_tree) for v in (after - after[0], np.stack([before, after[0]])))
+        creep = _CREEP * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree)
+        if (apart := (jumps > _JUMPS * moves.max(0) + creep).any((0, 2))).any():
+            warn(
+                f"expected steps of MuJoCo that say what a system is like, got some that a change of {_NEAR} m and rad "
+                f"leads far away in {apart.sum()} of {len(apart)} states: let its solver converge, with more "
+                f"iterations (opt.iterations) or softer constraints (solref, solimp), or take smaller time steps",
+                ContactWarning,
+            )
 
     def hold(self, read: Linearised, places: Places, states: Array, x: Array) -> Array:
         """Simulate at the nominal controls; linearise half way there what goes much farther without constraints."""
@@ -131,6 +152,11 @@ def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] |
     if (more := np.flatnonzero(~found)).size:
         lam[more] = solve_lcp(torch.from_numpy(F[more % len(F)]), torch.from_numpy(q[more])).lam.numpy()
     return lam.reshape(gap.shape)
+
+
+def _size(moved: Array, mass: Array, in_tree: NDArray[np.bool_]) -> Array:
+    """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
+    return np.sqrt(np.maximum(moved * _times(mass, moved) @ in_tree, 0.0))
 
 
 def _times(matrix: Array, vector: Array) -> Array:
@@ -219,20 +245,16 @@ def warn_of_wrong(
     without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
     """
     mass, model, in_tree = np.linalg.inv(inverse_mass), motion.model, motion.in_tree
-
-    def size(moved: Array) -> Array:
-        """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
-        energy = moved * (mass @ moved[..., None])[..., 0]
-        return np.sqrt(np.maximum(energy @ in_tree, 0.0))
-
+    predicted = np.where(np.abs(predicted) < _MOST, predicted, _MOST)  # where there is no number as well
     off, least = predicted - after, _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree)
-    change, alone = size(after - before), np.nan_to_num(size(free - before))
-    alone = np.where(alone < _NEVER * (size(before) + np.nan_to_num(change) + least), alone, 0.0).min(0)
-    moves = size(before) + alone
+    error, change, alone, speed = (_size(v, mass, in_tree) for v in (off, after - before, free - before, before))
+    alone = np.nan_to_num(alone)
+    alone = np.where(alone < _NEVER * (speed + np.nan_to_num(change) + least), alone, 0.0).min(0)
+    moves = speed + alone
     least = least + _NEARLY * np.nan_to_num(np.median(change, 0))  # near balance any error of large actions shows
     most = change + _FARTHER * moves + least
-    held = (change > _FARTHER * moves + least) & (size(off) > _HARDLY * change)
-    excess = (size(off) - np.where(held, 0.0, most)) / most
+    held = (change > _FARTHER * moves + least) & (error > _HARDLY * change)
+    excess = (error - np.where(held, 0.0, most)) / most
     wrong = np.any(excess > 0, (0, 2))
     if wrong.any():
         *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)

@@ -386,7 +386,10 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: Dynamic
     balanced = u + _find_balance(step, some, to[0], alone[0], (high - low).numpy())
     more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
     at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
-    warn_of_wrong(at[0], to[0], alone, step.velocity[some], read.moved.inverse_mass[some], step.motion)
+    more = step.velocity[some], read.moved.inverse_mass[some]
+    warn_of_wrong(at[0], to[0], alone, *more, step.motion)
+    ctrl = of.control(x, torch.from_numpy(step.idle[some])).numpy()
+    whole.warn_of_jumps(of._places, read.states[some], ctrl, *more)
 
 
 def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,7 +20,7 @@ _FUNCTIONS = (
 ).split()
 _FIELDS = (
     "qpos qvel act ctrl qacc_warmstart geom_xpos geom_xmat cdof subtree_com actuator_length qacc act_dot qfrc_smooth "
-    "ten_length"
+    "qfrc_constraint qfrc_applied ten_length"
 ).split()
 _VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error", "mjcb_time")
 _KINDS, _MOST, _FIRST = int(mujoco.mjtGeom.mjNGEOMTYPES), 128, 10  # doubles of a contact, and those that are read

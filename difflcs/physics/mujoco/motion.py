@@ -251,14 +251,15 @@ class Dynamic:
         bodies = factor, back
         step = self._steps(held, forces, damping, self.steps, *bodies)
         implicit = self._implicit(response @ heavier, forces)
+        if (some := read.unstable).any():
+            step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, *bodies)
         far = ~(np.abs(step).max((1, 2)) < _BEYOND)
         step[far] = implicit[far]
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        simulated = (
-            step if self.simulated == self.steps else self._steps(mass, forces, damping, self.simulated, *bodies)
-        )
-        if (some := read.unstable).any():
-            simulated[some] = step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, *bodies)
+        simulated = step
+        if self.simulated != self.steps:
+            simulated = self._steps(mass, forces, damping, self.simulated, *bodies)
+            simulated[some] = step[some]
         curved = np.arange(read.secant.shape[2]) + n_x
         more = (read.reached - _reached(simulated, velocity))[:, :, None]
         more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)

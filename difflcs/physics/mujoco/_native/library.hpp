@@ -58,8 +58,9 @@ struct Sparse {
 struct Place {
   const void* model;
   void* data;
-  double *qpos, *qvel, *act, *ctrl, *qacc_warmstart, *geom_xpos, *ccd_tolerance;
-  const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot, *qfrc_smooth, *ten_length;
+  double *qpos, *qvel, *act, *ctrl, *qacc_warmstart, *geom_xpos, *ccd_tolerance, *qfrc_applied;
+  const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot, *qfrc_smooth, *qfrc_constraint,
+      *ten_length;
   Sparse moment, tendon;  // derivatives of the lengths of actuators and tendons
   int32_t* warnings;  // how often MuJoCo has warned, by kinds
   int kinds, stride;  // of warnings, and from one to the next

@@ -104,11 +104,12 @@ Place make_place(const nb::dict& f) {
   p.data = at<void*>(f, "data");
   for (auto [name, into] : {std::pair{"qpos", &p.qpos}, {"qvel", &p.qvel}, {"act", &p.act}, {"ctrl", &p.ctrl},
                             {"qacc_warmstart", &p.qacc_warmstart}, {"geom_xpos", &p.geom_xpos},
-                            {"ccd_tolerance", &p.ccd_tolerance}})
+                            {"ccd_tolerance", &p.ccd_tolerance}, {"qfrc_applied", &p.qfrc_applied}})
     *into = at<double*>(f, name);
   for (auto [name, into] : {std::pair{"geom_xmat", &p.geom_xmat}, {"cdof", &p.cdof}, {"subtree_com", &p.subtree_com},
                             {"actuator_length", &p.actuator_length}, {"qacc", &p.qacc}, {"act_dot", &p.act_dot},
-                            {"qfrc_smooth", &p.qfrc_smooth}, {"ten_length", &p.ten_length}})
+                            {"qfrc_smooth", &p.qfrc_smooth}, {"qfrc_constraint", &p.qfrc_constraint},
+                            {"ten_length", &p.ten_length}})
     *into = at<const double*>(f, name);
   p.moment = make_sparse(value<nb::dict>(f, "moment"));
   p.tendon = make_sparse(value<nb::dict>(f, "tendon"));
@@ -123,6 +124,7 @@ Motion make_motion(const nb::dict& f) {
   m.simulated = at<const void*>(f, "simulated");
   m.linearised = at<const void*>(f, "linearised");
   m.advance = at<Act>(f, "advance");
+  m.held = value<bool>(f, "held");
   for (auto [name, into] : {std::pair{"nq", &m.nq}, {"nv", &m.nv}, {"nu", &m.nu}, {"na", &m.na}, {"steps", &m.steps}})
     *into = value<int>(f, name);
   for (auto [name, into] :
@@ -209,7 +211,7 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
         acceleration.size() == n * (nv + na) && rates.size() == n * (nv + na) * (size + nu) &&
         inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
         !places.empty());
-  const size_t each = motion.nq + 2 * nv + na + nu;
+  const size_t each = size + motion.nq + 3 * nv + na + nu;
   std::vector<double> memory(places.size() * each);
   return at_places(library, places, n, [&](size_t p, int64_t i) {
     const Linearised into{middle.data() + i * size,          acceleration.data() + i * (nv + na),

@@ -21,6 +21,7 @@ struct Motion {
   const void* linearised;  // the same with one step of a second of Euler's method: ν + acceleration
   Act advance;             // one step of the integrator; none: Runge and Kutta's
   int nq, nv, nu, na, steps;
+  bool held;  // by constraints that the linearised model has not
   std::vector<double> gain, constant, bias;  // (nu) of actuators that hold a length
   std::vector<double> low, high;             // (nu) range of controls
   std::vector<char> holds, relative;         // (nu)
@@ -43,7 +44,7 @@ class Reader {
   Reader(const Library& library, const Motion& motion, const Place& place)
       : library_(library), motion_(motion), place_(place) {}
 
-  // There is memory for a state, controls and a direction (nv).
+  // There is memory for a state, controls, rates and three directions (nv).
   void read(const double* state, const double* ctrl, const Linearised& into, double* memory) const {
     const Motion& m = motion_;
     read_mass(state, into.inverse_mass);
@@ -51,6 +52,9 @@ class Reader {
     for (int j = 0; j < m.nu; j++)
       into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? place_.actuator_length[j] : 0.0);
     simulate(m.steps / 2);
+    double *held = memory + m.size() + m.nq + m.nv + m.na + m.nu, *applied = held + m.nv;
+    if (m.held) forward(m.simulated);
+    std::copy_n(place_.qfrc_constraint, m.nv, held);
     forward(m.linearised);
     if (!std::all_of(place_.qacc, place_.qacc + m.nv, [](double a) { return std::fabs(a) < kBeyond; })) {
       set(state);
@@ -60,7 +64,13 @@ class Reader {
     std::copy_n(place_.qacc, m.nv, into.acceleration);
     std::copy_n(place_.act_dot, m.na, into.acceleration + m.nv);
     for (const Act check : {library_.check_pos, library_.check_vel, library_.check_acc}) check(m.linearised, place_.data);
+    std::copy_n(place_.qfrc_applied, m.nv, applied);
+    if (m.held) {  // what constraints hold is far from where it would go alone, and has other rates there
+      for (int v = 0; v < m.nv; v++) place_.qfrc_applied[v] += held[v] - place_.qfrc_constraint[v];
+      forward(m.linearised);
+    }
     differentiate(into, memory);
+    std::copy_n(applied, m.nv, place_.qfrc_applied);
     simulate(m.steps - m.steps / 2);
     change(state, into.reached);
   }
@@ -122,11 +132,13 @@ class Reader {
   void differentiate(const Linearised& into, double* now) const {
     const Motion& m = motion_;
     const int nx = m.size(), begins[] = {0, m.nv, 2 * m.nv, nx}, stages[] = {0, kPositions, kVelocities, kVelocities};
-    double *ctrl = now + m.nq + m.nv + m.na, *way = ctrl + m.nu;
+    double *ctrl = now + m.nq + m.nv + m.na, *way = ctrl + m.nu, *rates = way + m.nv;
     std::copy_n(place_.qpos, m.nq, now);
     std::copy_n(place_.qvel, m.nv, now + m.nq);
     std::copy_n(place_.act, m.na, now + m.nq + m.nv);
     std::copy_n(place_.ctrl, m.nu, ctrl);
+    std::copy_n(place_.qacc, m.nv, rates);
+    std::copy_n(place_.act_dot, m.na, rates + m.nv);
     const auto side = [&](int j) {  // 1 where a number may be more by the difference; −1: less; or neither
       if (j < nx) return 1;
       const double u = ctrl[j - nx], low = m.low[j - nx], high = m.high[j - nx];
@@ -142,7 +154,7 @@ class Reader {
         for (int i = m.nv; i < nx; i++) {
           if (m.tree[i] != m.tree[j] || side(j) == 0) continue;
           const double rate = i < 2 * m.nv ? place_.qacc[i - m.nv] : place_.act_dot[i - 2 * m.nv];
-          into.rates[(i - m.nv) * (nx + m.nu) + j] = (rate - into.acceleration[i - m.nv]) / (side(j) * kDifference);
+          into.rates[(i - m.nv) * (nx + m.nu) + j] = (rate - rates[i - m.nv]) / (side(j) * kDifference);
         }
       }
       set(now);
