@@ -154,7 +154,7 @@ def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] |
     return lam.reshape(gap.shape)
 
 
-def _size(moved: Array, mass: Array, in_tree: NDArray[np.bool_]) -> Array:
+def _size(moved: Array, mass: Any, in_tree: NDArray[np.bool_]) -> Array:
     """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
     return np.sqrt(np.maximum(moved * _times(mass, moved) @ in_tree, 0.0))
 
