@@ -94,6 +94,10 @@ constexpr int64_t kLong = 48, kFewVaried = 4, kSoftest = kVaried + 1;
 // Round a plan that kRefined starts of a group have found the local search seeks contacts, too, instead of drawing.
 constexpr double kHeld = 0.4, kOpened = 0.3, kMeltedSeeks = 0.7;
 constexpr int64_t kMostSeeks = 4, kRefined = 2;
+// A plan is suspect where other contacts cost much more: as the starts of a round cost more on average, each by at most
+// the part kDearest, up to kSuspected rounds in vain end the search.
+constexpr int64_t kSuspected = 6;
+constexpr double kDearest = 0.3;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
@@ -282,6 +286,7 @@ void MpcSearch::reserve(const MpcBatch& batch, const MpcEffort& effort) {
   for (auto* v : {&agreed, &found, &ended}) v->reserve(batch.count);
   grouped.resize(batch, batch.count);
   origin.reserve(jobs);
+  dearer.reserve(batch.count);
   closing.reserve(2 * batch.n_x);
 }
 
@@ -436,8 +441,9 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
   live.clear();
+  const int64_t sure = large(batch) ? effort.sure : std::max(effort.sure, kFixed);
   for (int64_t e = 0; e < count; e++) {
-    patience[e] = std::min(effort.seeks, effort.sure - found[e]);
+    patience[e] = std::min(effort.seeks, sure - found[e]);
     if (patience[e] > 0) live.push_back(e);
   }
   improve(batch, effort, to, runner, first, count, true);
@@ -709,7 +715,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
   const int64_t starts = effort.starts;
   const bool few = !seeking && starts < kVaried;
   const int64_t varied = few ? kFewVaried : kVaried;
-  const int64_t rounds = seeking ? kMostSeeks * effort.seeks : few ? 1 : 8 * starts;
+  const int64_t rounds = seeking ? kMostSeeks * std::max(effort.seeks, kSuspected) : few ? 1 : 8 * starts;
   idle.assign(count, 0);
   const auto done = [&](int64_t e) { return !solved(out.status[e]); };
   live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
@@ -735,6 +741,13 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
         vary(batch, effort, kind, shifted, out.u + e * n.u, j);
     }
     explore(batch, effort, runner, 0, all, false);
+    dearer.assign(count, 0.0);
+    for (int64_t j = 0; j < all && seeking && !large(batch); j++) {
+      const int64_t e = tried.owner[j];
+      const double more = std::max(tried.objective[j] - out.objective[e], 0.0) / std::abs(out.objective[e]);
+      dearer[e] += std::min(kDearest, more) / (kDearest * double(varied));
+      patience[e] = std::max(patience[e], int64_t(std::ceil(dearer[e] * double(kSuspected))));
+    }
     const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {
       const int64_t e = tried.owner[j];
       return promising(batch, j, out.u + e * n.u, out.objective[e]);

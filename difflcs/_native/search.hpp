@@ -15,7 +15,8 @@ constexpr int64_t kVaried = 8;  // variations of a plan at a time
 struct MpcEffort {
   int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
   int64_t groups;   // in which they are searched one after the other; at least one
-  int64_t sure;     // an element has no further group, and seeks nothing, once so many starts have found its best plan
+  int64_t sure;     // an element has no further group once so many starts have found its best plan, and seeks nothing
+                    // once as many have, of small problems kFixed at least
   int64_t seeks;    // rounds in vain that end the search for other contacts, or as many as starts are missing; 0: none
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
@@ -121,6 +122,7 @@ class MpcSearch {
   std::vector<int64_t> agreed, found;         // how many groups and starts have found the best plan of each
   std::vector<int64_t> ended;                 // how many starts of one group have found the plan of the group
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
+  std::vector<double> dearer;   // how much more the starts of a round cost than the plan of each
   std::vector<double> closing;  // costates of a gap, at a stage and at the next
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };

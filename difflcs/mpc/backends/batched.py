@@ -25,8 +25,9 @@ class Starts(NamedTuple):
     Attributes:
         starts: the number of all.
         groups: in which they are tried one after the other.
-        sure: an element has no further group, and seeks nothing, once so many starts have found its best plan.
-        seeks: rounds in vain that end the search for other contacts; fewer where fewer starts are missing to `sure`.
+        sure: an element has no further group once so many starts have found its best plan.
+        seeks: rounds in vain that end the search for other contacts; none where `sure` starts, four at least, have
+            found the plan, more where starts that make other contacts end at much dearer plans.
     """
 
     starts: int
@@ -37,7 +38,7 @@ class Starts(NamedTuple):
 
 _STARTS = {
     "fast": (Starts(1, 1, 1), Starts(3, 1, 1)),
-    "default": (Starts(4, 1, 3, 3), Starts(32, 2, 1, 1)),
+    "default": (Starts(4, 1, 4, 1), Starts(32, 2, 1, 1)),
     "best": (Starts(64, 4, 4), Starts(96, 6, 96, 24)),
 }
 # Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, get the second of these
@@ -88,10 +89,11 @@ class BatchedBackend(Backend):
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", four, and three rounds of eight in vain that seek contacts; "best", up to
-            four groups of sixteen; 3, 2 × 16 with one round and 6 × 16 with 24 where horizon × n_lam is 100 or more, or
-            20 times n_u, or the horizon 40, as such plans have many optima. A guess is the first start, and the only
-            one but for "best". Without contact (n_lam = 0) one start is enough.
+        effort: "fast", one start; "default", four, and one round of eight in vain that seeks contacts, up to six where
+            other contacts cost much more; "best", up to four groups of sixteen; 3, 2 × 16 with as many rounds and
+            6 × 16 with 24 where horizon × n_lam is 100 or more, or 20 times n_u, or the horizon 40, as such plans have
+            many optima. A guess is the first start, and the only one but for "best". Without contact (n_lam = 0) one
+            start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From four on with a local search,
             from 32 on in groups of sixteen until five end with the same plan.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
