@@ -51,9 +51,10 @@ class Reader {
     hold(ctrl);
     for (int j = 0; j < m.nu; j++)
       into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? place_.actuator_length[j] : 0.0);
+    simulate(m.steps / 2);
     double *held = memory + m.size() + m.nq + m.nv + m.na + m.nu, *applied = held + m.nv;
-    std::fill_n(held, m.nv, 0.0);
-    simulate(m.steps / 2, held);
+    if (m.held) forward(m.simulated);
+    std::copy_n(place_.qfrc_constraint, m.nv, held);
     forward(m.linearised);
     if (!std::all_of(place_.qacc, place_.qacc + m.nv, [](double a) { return std::fabs(a) < kBeyond; })) {
       set(state);
@@ -64,8 +65,8 @@ class Reader {
     std::copy_n(place_.act_dot, m.na, into.acceleration + m.nv);
     for (const Act check : {library_.check_pos, library_.check_vel, library_.check_acc}) check(m.linearised, place_.data);
     std::copy_n(place_.qfrc_applied, m.nv, applied);
-    if (m.held && m.steps > 1) {  // what constraints hold is far from where it would go alone, and has other rates
-      for (int v = 0; v < m.nv; v++) place_.qfrc_applied[v] += held[v] / (m.steps / 2) - place_.qfrc_constraint[v];
+    if (m.held) {  // what constraints hold is far from where it would go alone, and has other rates there
+      for (int v = 0; v < m.nv; v++) place_.qfrc_applied[v] += held[v] - place_.qfrc_constraint[v];
       forward(m.linearised);
     }
     differentiate(into, memory);
@@ -116,10 +117,9 @@ class Reader {
   void forward(const void* model) const { library_.forward(model, place_.data, 0, 1); }
 
   // Without the checks of `mj_step`, which warn of a motion that grows.
-  void simulate(int steps, double* held = nullptr) const {
+  void simulate(int steps) const {
     for (int k = 0; k < steps; k++) {
       forward(motion_.simulated);
-      for (int v = 0; held != nullptr && v < motion_.nv; v++) held[v] += place_.qfrc_constraint[v];
       if (motion_.advance != nullptr) {
         motion_.advance(motion_.simulated, place_.data);
       } else {
