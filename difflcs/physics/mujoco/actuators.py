@@ -213,6 +213,8 @@ class Actuators:
             activation: (n, na) where it is linearised.
             rates: (n, nv + na, n_x + nu) rates of velocities and activation by the state and by control.
         """
+        if not self._muscles.size:
+            return
         i, at = self._muscles, activation[:, self._muscles]
         acts, row = self.activated[i], rates.shape[1] - len(self._time) + i
         (rise, fall), ctrl = self._rates[i].T, ctrl[:, acts]

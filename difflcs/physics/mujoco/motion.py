@@ -187,12 +187,13 @@ class Dynamic:
         unstable = np.zeros(len(read.rates), dtype=bool)
         for stiff, damped in both:
             rates = h * damped + 0.5 * h * h * stiff
-            if self.simulated.integrator != _RK4:
-                implicit = -damped if self.simulated.integrator != _EULER else inverse_mass * self.damping
+            implicit = -damped if self.simulated.integrator != _EULER else inverse_mass * self.damping
+            if self.simulated.integrator != _RK4 and implicit.any():
                 rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
             found = np.einsum("nij,nji->n", rates, rates) > most**2  # the sum of squares of the eigenvalues
-            found[found] = np.linalg.eigvals(rates[found]).real.min(-1, initial=0.0) < -most
-            unstable |= found
+            if found.any():
+                found[found] = np.linalg.eigvals(rates[found]).real.min(-1) < -most
+                unstable |= found
         return unstable
 
     def describe(self, steps: Steps, disabled: int) -> _mujoco.Motion:
@@ -266,8 +267,9 @@ class Dynamic:
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
         linear = step[:, :, curved]
         step[:, :, [*curved, -1]] += more
-        kept = (linear * step[:, :, curved]).sum(1) / np.maximum((linear * linear).sum(1), 1e-300)
-        implicit[:, :, curved] *= np.clip(kept, 0.0, 1.0)[:, None]
+        if curved.size:
+            kept = (linear * step[:, :, curved]).sum(1) / np.maximum((linear * linear).sum(1), 1e-300)
+            implicit[:, :, curved] *= np.clip(kept, 0.0, 1.0)[:, None]
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
         turn = None if tangent is None else _find_turn(tangent)
         return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal, turn)
@@ -296,7 +298,9 @@ class Dynamic:
                 response = np.linalg.solve(np.eye(nv) + 0.5 * response @ (turns.swapaxes(-1, -2) - turns), response)
                 one[:, nv : 2 * nv] += h * response @ mass @ rates
             else:
-                one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass) @ rates
+                if damping.any():
+                    rates = np.linalg.solve(mass + h * damping, mass) @ rates
+                one[:, nv : 2 * nv] += h * rates
             one[:, :nv] += h * one[:, nv : 2 * nv]
             one[:, 2 * nv : n_x] += activation
         with np.errstate(over="ignore", invalid="ignore"):

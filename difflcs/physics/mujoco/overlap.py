@@ -43,6 +43,8 @@ class Overlaps(NamedTuple):
 
     def evaluate(self, at: Situation) -> Nominal:
         """Evaluate all else at the nominal action, with friction that holds, and add the soft contacts of a step."""
+        if not self.soft.any():
+            return evaluate_nominal(at)
         normal, hard = at.contacts.normal, ~self.soft[:, :, None]
         nominal = evaluate_nominal(at._replace(contacts=at.contacts._replace(normal=normal * hard)))
         gap = np.where(self.soft, self.gap, nominal.contacts.gap)
@@ -69,6 +71,8 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
     most = ease * model.body_invweight0[model.geom_bodyid, 0][geoms].sum(-1)
     soft = (contacts.gap < 0) & (contacts.friction > 0) & at.rough & (most > _SOFT * moves)
     firm, force = np.zeros_like(moves), np.zeros_like(moves)
+    if not soft.any():
+        return Overlaps(soft, firm, force)
     for i in np.flatnonzero(soft.any(-1)):
         with native(model, data, f"in state {i} of {len(qpos)}"):
             data.qpos[:] = qpos[i]
