@@ -56,6 +56,8 @@ struct MpcBatch {
   // where a matrix changes, or which fields are given by stage. 0: it keeps nothing.
   int64_t version;
 
+  // Whether its problems are so large that they are solved one by one.
+  bool large() const { return n_x + n_u >= kAlone || n_lam >= kAloneForces; }
   // Field `which` of a problem at stage k.
   int64_t element_of(int64_t problem) const { return element ? element[problem] : problem; }
   const double* at(int which, int64_t problem, int64_t k = 0) const {

@@ -31,10 +31,11 @@ class Solver {
     Stages<Matrix<Vec, S::kU, S::kX>> feedback;
   } law, origin;  // of the next step, and the one around x = 0 where that is kept
   Vec *newton, *dx, *du;
+  const Mask large;  // in all lanes, where forces on the way of the homotopy need not be exact
   Mask* rows;
 
  public:
-  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), progress(b, problem) {
+  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), progress(b, problem), large(b.large() ? ~Mask{} : Mask{}) {
     layout(memory);
   }
 
@@ -67,8 +68,9 @@ class Solver {
   void contacts(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
     if (n.l() == 0) return;
     data.gap(x, u, progress.gap);
+    const Vec rounding = select((progress.eps > batch.relaxation) & large, all(kRoughly), all(kExactly));
     Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot, &problem.low_rank[k])
-        .solve(lam, s, progress.eps, skip);
+        .solve(lam, s, progress.eps, rounding, skip);
   }
 
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane, unless the next step needs none.
@@ -166,7 +168,8 @@ class Solver {
       for (int64_t i = 0; i < at.u.size(); i++)
         slope += riccati.gradient.entries[i] * (next.u.entries[i] - at.u.entries[i]);
       const Mask good =
-          (progress.released | (value <= progress.J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(progress.J)))) &
+          (progress.released | (progress.ahead & (abs(value) < kHuge)) |
+           (value <= progress.J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(progress.J)))) &
           ~accepted;
       J_trial = select(good, value, J_trial);
       gain = select(good & (slope < 0), 2.0 * (value - progress.J) / slope, gain);
@@ -239,6 +242,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     if (live == 0) break;
     weak = sweep.weak;
     Vec step, gain;
+    progress.go_ahead(o, sweep, frozen);
     const Mask moved = search(frozen, step, gain, watch);
     progress.advance(o, sweep, frozen, moved, step, gain);
     const Mask first = progress.released & ~frozen;

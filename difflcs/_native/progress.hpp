@@ -45,6 +45,8 @@ constexpr int64_t kStepsBeforeCertificate = 2;
 // A large weight of the augmented Lagrangian amplifies the rounding of a constraint. If more than this part of the
 // gradient is left at such a vertex, the multipliers are computed once more with the first weight.
 constexpr double kRoundingLeft = 1e-9;
+// Projected gradient, as a multiple of that of a solved problem, at which a stage of the homotopy is solved.
+constexpr double kSolvedStage = 1e4;
 // Steps that each gain as much as the last one must not be enough for a start that is left early.
 constexpr double kHope = 100.0;
 
@@ -82,6 +84,7 @@ struct Progress {
   Mask gauss_newton;   // by Gauss-Newton
   Mask at_origin;      // released by the law around x = 0, see newton.hpp
   Mask stale_cost;     // J is that of earlier multipliers
+  Mask ahead;          // in a step to the relaxation of the next stage
   // Elements that are finished but not certified yet, and whether some direction at their plan is flat.
   int64_t finished[kLanes];
   bool flat[kLanes];
@@ -338,6 +341,27 @@ struct Progress {
     }
   }
 
+  // Relaxation of the next stage of a lane. A stage that is solved `at_once`, before its first step, leads as far as four.
+  double next_stage(const MpcSolve& o, int l, bool at_once) const {
+    double shrink = o.shrink;
+    if (at_once) {
+      shrink *= shrink;
+      shrink *= shrink;
+    }
+    return eps[l] * shrink > batch.relaxation ? eps[l] * shrink : batch.relaxation;
+  }
+
+  // Lets the steps of large problems end at the relaxation of the next stage, which saves them a rollout there. A stage
+  // has one step, whose success the cost does not tell, as it depends on the relaxation: it is taken.
+  void go_ahead(const MpcSolve& o, const Sweep& sweep, Mask frozen) {
+    ahead = Mask{};
+    for (int l = 0; l < kLanes && batch.large() && batch.barrier == 0; l++) {
+      if (frozen[l] || released[l] || eps[l] <= batch.relaxation) continue;
+      put(&eps, 0, l, next_stage(o, l, sweep.projected[l] < kSolvedStage * o.tol));
+      ahead[l] = -1;
+    }
+  }
+
   // Damping and homotopy after a step.
   void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step, Vec gain) {
     const double target = batch.relaxation;
@@ -347,7 +371,7 @@ struct Progress {
       a.iterations++;
       a.in_stage++;
       a.failures = moved[l] ? 0 : a.failures + 1;
-      const bool gains = eps[l] > target || (moved[l] && a.gained > kNoGain * (1.0 + __builtin_fabs(J[l])));
+      const bool gains = ahead[l] || eps[l] > target || (moved[l] && a.gained > kNoGain * (1.0 + __builtin_fabs(J[l])));
       a.without_gain = gains ? 0 : a.without_gain + 1;
       // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
       // that had to be shortened too, and one that gained what its model promised for less.
@@ -358,15 +382,12 @@ struct Progress {
       else if (gain[l] > 0.8 && (reg *= 0.3) < 0.2 * kLeastDamping)
         reg = 0;
       // `steps` steps per stage of the homotopy, fewer where the stage is solved.
-      const bool solved = sweep.projected[l] < 1e4 * o.tol;
-      if (eps[l] > target && (a.in_stage >= o.steps || solved || a.failures > 0)) {
-        // A stage that was solved before its first step leads on as far as four.
-        double shrink = o.shrink;
-        if (a.in_stage == 1 && solved) {
-          shrink *= shrink;
-          shrink *= shrink;
-        }
-        eps[l] = eps[l] * shrink > target ? eps[l] * shrink : target;
+      const bool solved = sweep.projected[l] < kSolvedStage * o.tol;
+      if (ahead[l]) {
+        a.in_stage = a.failures = 0;
+        needs_rollout[l] = ~moved[l];
+      } else if (eps[l] > target && (a.in_stage >= o.steps || solved || a.failures > 0)) {
+        put(&eps, 0, l, next_stage(o, l, a.in_stage == 1 && solved));
         a.in_stage = 0;
         a.failures = 0;
         needs_rollout[l] = -1;

@@ -29,6 +29,9 @@ inline void lcp_slack(int64_t n, const T* F, const Vec* q, const Vector& lam, Ve
   }
 }
 
+// Parts of the terms of g below which it counts as zero: rounding, and what is enough on the way to other problems.
+constexpr double kExactly = 1e-15, kRoughly = 1e-9;
+
 // Where lam o w differs from eps by more than this part of it, a solution is polished.
 constexpr double kMissed = 1e-7;
 
@@ -70,8 +73,8 @@ class RelaxedLcp {
         w_next(memory + n * n + 5 * n),
         root_next(memory + n * n + 6 * n) {}
 
-  // From the guess in `lam_out`, at eps. Lanes in `skip` keep lam_out and w_out.
-  DIFFLCS_INLINE void solve(Vec* lam_out, Vec* w_out, Vec eps, Mask skip) {
+  // From the guess in `lam_out`, at eps, to g of this part of its terms. Lanes in `skip` keep lam_out and w_out.
+  DIFFLCS_INLINE void solve(Vec* lam_out, Vec* w_out, Vec eps, Vec rounding, Mask skip) {
     const int64_t n = size();
     const Vec eps4 = 4.0 * eps;
     DIFFLCS_UNROLL
@@ -89,7 +92,7 @@ class RelaxedLcp {
         magnitude = max(magnitude, part * (abs(lam[i]) + abs(w[i]) + abs(q[i])));
       }
       // Converged at rounding level, or stuck just above it.
-      const Vec floor = 1e-15 * magnitude;
+      const Vec floor = rounding * magnitude;
       done |= (merit <= floor * floor) | ((merit <= 1e-24 * magnitude * magnitude) & (merit > 0.25 * best)) |
               (merit != merit);
       best = min(best, merit);

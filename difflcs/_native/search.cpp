@@ -35,10 +35,10 @@ constexpr int64_t kNear = 2;
 // If of half of the starts, kHalf for each action at least, one in kFound finds the best plan and at most one in kLone
 // ends where no other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Four
 // that agree so are spared the local search. Starts after the first kFixed are left where they seem not to come below the
-// best cost by this part of it. A start of problems that are solved one by one costs as much as the first: of theirs half
+// best cost by this part of it. A start of problems that are solved one by one costs as much as the first: of theirs kBrief
 // are enough, whatever the number of actions, and the local search ends with the first round in vain, unless contacts are
 // sought for long at last.
-constexpr int64_t kHalf = 8, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
+constexpr int64_t kHalf = 8, kBrief = 6, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
 constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
 // A bound that is this many times farther than that plan counts as none.
@@ -231,9 +231,6 @@ int64_t finders(const double* reached, int64_t count, double one) {
 // Rounds that the local search of a long plan has besides those in vain that end it.
 int64_t longer(const MpcBatch& b, int64_t starts) { return starts * std::min(b.horizon, kLong) / kLong; }
 
-// Whether its problems are solved one by one.
-bool large(const MpcBatch& b) { return b.n_x + b.n_u >= kAlone || b.n_lam >= kAloneForces; }
-
 // Whether `count` starts, which reached these objectives, make others unnecessary.
 bool settled(const double* reached, int64_t count) {
   const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
@@ -299,7 +296,7 @@ void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       kernels, batch, solve.max_iter == 0,  // which takes no time
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        const auto solve = c.batch.count == 1 || large(c.batch) ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
+        const auto solve = c.batch.count == 1 || c.batch.large() ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
         solve(c.batch, c.solve, &c.next, workspace, watch);
       },
       &context);
@@ -324,6 +321,7 @@ void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
+  if (batch.large()) effort.shrink *= effort.shrink;  // as good, in .7 of the iterations
   const int64_t chunk = std::max(kChunk, kJobs / effort.jobs());
   MpcBatch searched = batch;
   const bool near = effort.starts == 1 && guess.lam;  // a plan with its forces, of the step before
@@ -441,7 +439,7 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     members.erase(std::remove_if(members.begin(), members.end(), done), members.end());
   }
   live.clear();
-  const int64_t sure = large(batch) ? effort.sure : std::max(effort.sure, kFixed);
+  const int64_t sure = batch.large() ? effort.sure : std::max(effort.sure, kFixed);
   for (int64_t e = 0; e < count; e++) {
     patience[e] = std::min(effort.seeks, sure - found[e]);
     if (patience[e] > 0) live.push_back(e);
@@ -456,9 +454,9 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   const Sizes n(batch);
   const MpcPlans out = grouped.plans();
   const bool guessed = guess.u && start == 0, whole = guess.lam;  // by actions alone, or by forces too
-  const bool brief = large(batch) && effort.seeks < kRounds;
-  const int64_t starts = effort.starts, least = brief ? kHalf : kHalf * batch.n_u;
-  const int64_t half = starts < kVaried ? starts : std::max(least, starts / 2);
+  const bool brief = batch.large() && effort.seeks < kRounds;
+  const int64_t starts = effort.starts, many = std::max(kHalf * batch.n_u, starts / 2);
+  const int64_t half = starts < kVaried ? starts : brief ? kBrief : many;
   const int64_t shift = guess.u ? 1 : 0;
 
   tried.resize(batch, 0);
@@ -742,7 +740,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
     }
     explore(batch, effort, runner, 0, all, false);
     dearer.assign(count, 0.0);
-    for (int64_t j = 0; j < all && seeking && !large(batch); j++) {
+    for (int64_t j = 0; j < all && seeking && !batch.large(); j++) {
       const int64_t e = tried.owner[j];
       const double more = std::max(tried.objective[j] - out.objective[e], 0.0) / std::abs(out.objective[e]);
       dearer[e] += std::min(kDearest, more) / (kDearest * double(varied));
