@@ -256,7 +256,7 @@ def test_nearly_every_problem_is_solved(build, kind):
 
 def test_plans_of_many_contacts_get_more_starts():
     def starts(horizon, n_lam, guessed, n_u=6, **options):
-        problem = SimpleNamespace(horizon=horizon, n_lam=n_lam, n_u=n_u)
+        problem = SimpleNamespace(horizon=horizon, n_x=9, n_lam=n_lam, n_u=n_u)
         efforts = [options] if options else [{"effort": effort} for effort in ("fast", "default", "best")]
         return [BatchedBackend(**one).starts(problem, guessed)[:2] for one in efforts]
 
@@ -266,6 +266,7 @@ def test_plans_of_many_contacts_get_more_starts():
     assert starts(20, 5, guessed=True) == [(1, 1), (1, 1), (96, 6)]
     assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [(3, 1), (32, 2), (96, 6)]
     assert starts(10, 5, guessed=False, n_u=3) == [(1, 1), (4, 1), (64, 4)]
+    assert starts(4, 48, guessed=False) == [(3, 1), (10, 1), (96, 6)]  # solved one by one
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [(5, 1)]
 
 
