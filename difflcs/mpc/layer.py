@@ -25,6 +25,7 @@ from difflcs.mpc.setup import (
     Cost,
     Setup,
     System,
+    check_alone,
     check_constraints,
     check_cost,
     check_stage_bounds,
@@ -106,6 +107,7 @@ class LCSMPCLayer(nn.Module):
 
     u_min: Tensor
     u_max: Tensor
+    backend: Backend
 
     @takes_arrays
     def __init__(
@@ -128,8 +130,10 @@ class LCSMPCLayer(nn.Module):
         super().__init__()
         self.lcs, self.cost, self.horizon, self.passes = lcs, cost, horizon, passes
         self.relaxation, self.training_relaxation, self.barrier = relaxation, training_relaxation, barrier
-        self.on_failure, self.backend, self.constraints = on_failure, get_backend(backend), constraints
-        self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
+        self.on_failure, self.constraints, self.bounds = on_failure, constraints, bounds
+        self.backend = backend  # pyright: ignore[reportAttributeAccessIssue]  (which makes an instance of a name)
+        if bounds is not None:
+            check_alone(u_min=u_min, u_max=u_max)
         for name, value in (("u_min", u_min), ("u_max", u_max)):
             register(self, name, self._bound(name, value), persistent=False)
         self.setup().check()

@@ -230,13 +230,16 @@ def check_constraints(constraints: object) -> Constraints:
     return check_kind("constraints", constraints, (LinearConstraints, ConstraintSequence), "build one from G and g")
 
 
-def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
-    """Refuse anything but `StageBounds`, and bounds that are passed twice."""
-    bounds = check_kind("bounds", bounds, StageBounds, "pass constant bounds as u_min and u_max")
+def check_stage_bounds(bounds: object) -> StageBounds:
+    """Refuse anything but `StageBounds`."""
+    return check_kind("bounds", bounds, StageBounds, "pass constant bounds as u_min and u_max")
+
+
+def check_alone(**plain: object) -> None:
+    """Refuse bounds that are passed beside `StageBounds`."""
     for name, value in plain.items():
         if value is not None:
             raise ShapeError(f"{name}: expected none with bounds, got {describe(value)}; put it into the StageBounds")
-    return bounds
 
 
 @dataclass
@@ -265,6 +268,12 @@ class Inputs:
             system = system_at(lcs, x0, context) if along is None else sequence_along(lcs, along, x0, context)
             returned = f"return one of them from {type(lcs).__name__}.params"
             system = check_kind("lcs", system, (LCSParams, LCSSequence), returned)
+            for name in ("n_x", "n_u", "n_lam"):
+                if (said := getattr(lcs, name)) != (got := getattr(system, name)):
+                    of = type(lcs).__name__
+                    raise ShapeError(
+                        f"lcs: expected {name}={said} from {of}.params, as {of}.{name} says, got {got}; correct one"
+                    )
         system.check_again()
         if isinstance(system, LCSSequence):
             self.check_horizon("lcs", system.horizon)
@@ -333,7 +342,8 @@ class Inputs:
         """Take the bounds of a call, or else of a layer; without x0 those that depend on no state."""
         bounds = setup.bounds
         if call.bounds is not None:
-            bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
+            bounds = check_stage_bounds(call.bounds)
+            check_alone(u_min=call.u_min, u_max=call.u_max)
         if bounds is None:
             self.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, x0), strict=True))
         else:

@@ -46,7 +46,8 @@ class MPCSolution:
         mu: (..., H+1, n_c) multipliers of the constraints: the cost that one more unit of g would save. Detached.
         objective: (...) cost of the plan.
         status: (...) `Status` as int8.
-        iterations: (...) iterations of the solver, int32.
+        iterations: (...) iterations of the solver, int32, from all its starts; those of variations of a plan that were
+            given up before they were solved are left out.
         kkt_residual: (...) largest violation of the optimality conditions by the numbers above, dimensionless; at most
             1e-6 where an exact backend has solved the plan. See `kkt.residual`, or a bound of it below 1e-12.
         solve_time: (...) seconds spent on each problem.

@@ -283,6 +283,8 @@ FITS_NOT_A_CALL = [
      r"batch dimensions .* do not fit.*x0 \(6,\)"),
     (lambda b: {"lcs": SimpleNamespace(n_x=4, n_u=2, n_lam=3, params=lambda x, context: {})}, DTypeError,
      "lcs: expected LCSParams or LCSSequence, got dict.*; return one of them from SimpleNamespace.params"),
+    (lambda b: {"lcs": SimpleNamespace(n_x=4, n_u=2, n_lam=5, params=lambda x, context: b.params(3))}, ShapeError,
+     "lcs: expected n_lam=5 from SimpleNamespace.params, as SimpleNamespace.n_lam says, got 3; correct"),
     (lambda b: {"context": ones(2)}, ShapeError, "context: expected none with LCSParams, .*; pass lcs="),
     (lambda b: {"goal": ones(4)}, ShapeError, "goal: expected none with a QuadraticCost"),
     (lambda b: {"reference": ones(4, 4)}, ShapeError, "reference: expected none with a QuadraticCost"),

@@ -114,6 +114,7 @@ def test_groups_have_budgets_of_contacts_and_of_friction():
     far[14] += 0.02  # the ball: beyond its own distance, so that its contact is padded with one out of reach
     assert module.contacts(far).gap[5] == 0.05
     assert not module.contacts(far).normal[5].any()
+    assert MujocoLCS(model, motion="quasi-dynamic", contacts={("floor", "box"): 4, "round": 1}).n_contacts == 5
 
 
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
@@ -127,7 +128,8 @@ def test_what_rests_on_contacts_of_a_group_without_friction_does_not_creep(cone)
 
 
 @pytest.mark.parametrize(
-    ("contacts", "words"), [([], "one at least"), (["block"], "ContactGroup"), ([ContactGroup("x", 1)], "'x'")]
+    ("contacts", "words"),
+    [([], "one at least"), (["block"], "ContactGroup"), ([ContactGroup("x", 1)], "'x'"), ({"round": "all"}, "an int")],
 )
 def test_groups_that_do_not_fit_are_refused(contacts, words):
     refuse(InvalidInputError, words, MujocoLCS, stack(), motion="quasi-dynamic", contacts=contacts)

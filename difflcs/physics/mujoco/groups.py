@@ -1,6 +1,6 @@
 """Budgets of contacts by groups: how many contacts of which geoms a system has, and whether they have friction."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +32,11 @@ class ContactGroup(NamedTuple):
     distance: float | None = None
 
 
-def find_budgets(
-    model: Any, contacts: int | Sequence[ContactGroup] | None, distance: float
-) -> int | list[Budget] | None:
+Groups = Sequence[ContactGroup] | Mapping[Any, int]
+"""Groups, or the number of contacts of each `ContactGroup.of`: {("object", "hand"): 10}."""
+
+
+def find_budgets(model: Any, contacts: int | Groups | None, distance: float) -> int | list[Budget] | None:
     """Return the budgets of groups for a `ContactFinder`, or the number of contacts that is given in place of groups.
 
     Args:
@@ -42,11 +44,14 @@ def find_budgets(
         contacts: the groups; a pair of geoms belongs to the first that has one of the two.
         distance: of the module [m].
     """
+    if isinstance(contacts, Mapping):
+        contacts = [ContactGroup(*group) for group in contacts.items()]
     if not isinstance(contacts, Sequence):
         return None if contacts is None else check_positive_int("contacts", contacts, maximum=_MOST)
     if not contacts or not all(isinstance(group, ContactGroup) for group in contacts):
         raise InvalidInputError(
-            f"contacts: expected a number, or a list of ContactGroup, got {describe(contacts)}; give one at least"
+            f"contacts: expected a number, a list of ContactGroup, or a number for each pair of geoms or bodies, got "
+            f'{describe(contacts)}; give one at least, as in {{("object", "hand"): 10}}'
         )
     number = np.full((model.ngeom, model.ngeom), -1)  # of the group of each pair
     for i, group in enumerate(contacts):

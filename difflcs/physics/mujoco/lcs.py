@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import mujoco
@@ -21,7 +20,7 @@ from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces, predict, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
-from difflcs.physics.mujoco.groups import ContactGroup, find_budgets
+from difflcs.physics.mujoco.groups import Groups, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
@@ -73,7 +72,7 @@ class MujocoLCS:
         seconds: of a step [s].
         contacts: how many a state has, the nearest, where there are more of four a pair; missing ones are padded with
             contacts out of reach. None: as many points as the shapes of all pairs may touch in, at most 12, with a
-            `ContactWarning` where more touch.
+            `ContactWarning` where more touch. By groups: a list of `ContactGroup`, or {("object", "hand"): 10}.
         distance: contacts farther away are left out [m]; None: ten times `length`.
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
             (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
@@ -110,7 +109,7 @@ class MujocoLCS:
         *,
         motion: Motion = "quasi-static",
         seconds: float = 0.1,
-        contacts: int | Sequence[ContactGroup] | None = None,
+        contacts: int | Groups | None = None,
         distance: float | None = None,
         pairs: Pairs | None = None,
         friction: float | None = None,
