@@ -1,6 +1,5 @@
 """An LCS in the frame of a body on a plane: what it learns at one pose of the body holds at all of them."""
 
-from collections.abc import Mapping
 from typing import Any, Self
 
 import torch
@@ -215,21 +214,6 @@ class BodyFrameLCS(LCSModel):
         with torch.no_grad():
             model.A -= torch.eye(model.n_x, dtype=model.A.dtype, device=model.A.device)
         return model
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Self:
-        """See `LCSModel`. Earlier files have no frame: their states are x, y, yaw of the body and points."""
-        if "turn" in tensors or not {"A", "B", "D", "units"} <= {*tensors}:
-            return super().from_config(config, tensors, source)
-        (n_x, points), n_u, pad = tensors["A"].shape, tensors["B"].shape[-1], nn.functional.pad
-        pairs = [tuple((k, k + 1) for k in range(first, size - 1, 2)) for first, size in ((3, n_x), (0, n_u))]
-        first = cls(n_x, n_u, 1, frame=Frame(2, (0, 1), *pairs), dtype=tensors["A"].dtype).state_dict()
-        mean, scale, others = tensors["units"].split([points, points, n_u + n_x])
-        units = torch.cat([pad(mean, (3, 0)), pad(scale, (3, 0), value=1.0), others])
-        columns = {name: pad(tensors[name], (3, 0)) for name in ("A", "D")}
-        return super().from_config(
-            config, {**tensors, **{name: first[name] for name in _KNOWN}, **columns, "units": units}, source
-        )
 
 
 def _rotation(turn: Tensor, angle: Tensor) -> Tensor:

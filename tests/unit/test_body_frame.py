@@ -88,17 +88,6 @@ def test_without_a_frame_it_is_a_constant_lcs(build):
             torch.testing.assert_close(value, getattr(system, name))
 
 
-def test_files_without_a_frame_are_of_a_pose_and_points(build):
-    frame = Frame(2, (0, 1), ((3, 4), (5, 6)), ((0, 1), (2, 3)))
-    lcs, x, u = BodyFrameLCS(7, 4, 3, frame=frame, init_scale=0.3), build.normal(0)(9, 7), build.normal(1)(9, 4)
-    lcs.take_units(x, u, 2 * x)
-    tensors = {name: value for name, value in lcs.state_dict().items() if name not in ("yaw", "seen", "turn", "turn_u")}
-    tensors |= {name: tensors[name][:, 3:] for name in ("A", "D")}
-    tensors["units"] = torch.cat([tensors["units"][3:7], tensors["units"][10:]])
-    again = BodyFrameLCS.from_config(lcs.config(), tensors, "old")
-    torch.testing.assert_close(again.params(x).step(x, u).x_next, lcs.params(x).step(x, u).x_next, rtol=0, atol=0)
-
-
 @pytest.mark.slow
 def test_the_warmup_finds_the_frame_and_goes_on_with_it():
     """With PPO after it: tests/conformance/test_methods.py."""
