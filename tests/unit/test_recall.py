@@ -124,16 +124,8 @@ def test_changed_goals_and_states_are_noticed():
     assert_as_fresh(layer, x, goal.float())
 
 
-def test_settings_and_arguments_of_a_call_are_noticed():
-    layer = make_layer(training_relaxation=1e-2)
-    for change in (layer.eval, layer.train, layer.eval):
-        change()
-        assert_as_fresh(layer, X, GOAL)
-    layer.relaxation = 1e-4
-    assert_as_fresh(layer, X, GOAL)
-    layer.barrier = 1e-3
-    assert_as_fresh(layer, X, GOAL)
-    other, limit = make_model(seed=5), 0.2 * torch.ones(HORIZON, 2).double()
+def test_arguments_of_a_call_are_noticed():
+    layer, other, limit = make_layer(), make_model(seed=5), 0.2 * torch.ones(HORIZON, 2).double()
     for kwargs in (
         {"lcs": other},
         {"lcs": LCSModel(4, 2, 5, init_scale=0.3, generator=torch.Generator().manual_seed(6))},
@@ -144,10 +136,6 @@ def test_settings_and_arguments_of_a_call_are_noticed():
         {},
     ):
         assert_as_fresh(layer, X, GOAL, **kwargs)
-    layer.horizon = HORIZON + 1
-    assert_as_fresh(layer, X, GOAL)
-    layer.lcs.stiffness = 0.7
-    assert_as_fresh(layer, X, GOAL)
 
 
 def test_a_loop_asks_neither_model_nor_cost_again(monkeypatch):
@@ -175,10 +163,16 @@ def test_a_loop_asks_neither_model_nor_cost_again(monkeypatch):
         asked.clear()
 
 
-def test_other_parts_are_noticed():
-    layer = make_layer()
+def test_other_settings_and_parts_are_noticed():
+    layer = make_layer(training_relaxation=1e-2)
     params = make_model(seed=7).params().detach()
     for change in (
+        layer.eval,
+        layer.train,
+        layer.eval,
+        lambda: setattr(layer, "relaxation", 1e-4),
+        lambda: setattr(layer, "barrier", 1e-3),
+        lambda: setattr(layer.lcs, "stiffness", 0.7),
         lambda: setattr(layer, "lcs", make_model(seed=5)),
         lambda: setattr(layer.lcs, "action_support", torch.tensor([[-0.1, -0.2], [0.1, 0.2]]).double()),
         lambda: setattr(layer.lcs, "action_support", None),
@@ -193,6 +187,7 @@ def test_other_parts_are_noticed():
         lambda: setattr(layer, "lcs", make_model(seed=8).params().detach()),
         lambda: (delattr(layer.cost, "Q"), setattr(layer.cost, "Q", 3 * layer.cost.Q_final)),  # no buffer any more
         lambda: layer.cost.Q.mul_(1.5),
+        lambda: setattr(layer, "horizon", HORIZON + 1),
     ):
         plan(layer, X, GOAL)
         change()
