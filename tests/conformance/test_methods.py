@@ -6,7 +6,7 @@ The methods of the library on a task of one's own, by the common code; a method 
 import json
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -202,11 +202,6 @@ def test_a_state_decides_everything_that_follows(name, make_trainer):
     assert same(one.state_dict(), other.state_dict())
 
 
-def test_another_seed_is_another_training(finished, tmp_path):
-    other = train(make_config("violation", seed=1), tmp_path / "other").model / "model.safetensors"
-    assert other.read_bytes() != (finished("violation").model / "model.safetensors").read_bytes()
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -256,17 +251,10 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     assert contents(run.path) == files
 
 
-def test_a_run_is_not_continued_with_another_configuration_or_environment(finished, tmp_path):
-    name = "violation"
+def test_a_run_is_not_continued_with_another_configuration(finished):
     for change in ({"seed": 1}, {"minutes": 3.5}, {"evaluate_goals": 2}):
         with pytest.raises(CheckpointError, match=f"expected {next(iter(change))} = .*, got "):
-            train(make_config(name, **change), finished(name).path, resume=True)
-    described = replace(TOY, describe=lambda env: {"mass": 1.0})
-    with pytest.raises(KeyboardInterrupt):
-        train(make_config(name), tmp_path / "run", task=described, reporter=Dies())
-    other = replace(TOY, describe=lambda env: {"mass": 2.0})
-    with pytest.raises(CheckpointError, match="the environment it was started with"):
-        train(make_config(name), tmp_path / "run", task=other, resume=True)
+            train(make_config("violation", **change), finished("violation").path, resume=True)
 
 
 def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
@@ -350,19 +338,6 @@ def test_smoke_is_valid_and_small(name):
     tiny = TrainConfig(task="toy", method=usual, minutes=0.1 if name != "lcs-rl" else 5.0)
     tiny, asked = tiny.smoke(), tiny.minutes
     assert (tiny.minutes <= asked, tiny.evaluate_goals, tiny.final_goals) == (True, 4, 4)
-
-
-def test_its_configuration_survives_json(name):
-    config = make_config(name, minutes=12.0)
-    plain = json.loads(json.dumps(config.to_json()))
-    assert TrainConfig.from_json(plain) == config
-    assert plain["settings"] == json.loads(json.dumps(asdict(config.method)))
-
-
-def test_lcs_rl_needs_more_data_than_its_warmup():
-    with pytest.raises(InvalidInputError, match=r"--minutes 30, a shorter --warmup-minutes, or --method"):
-        get_method("lcs-rl")().check(3.0)
-    get_method("lcs-rl")().check(3.5)
 
 
 @pytest.mark.parametrize("method", [None, 3, Method, type("Nameless", (get_method("violation"),), {"name": None})])
