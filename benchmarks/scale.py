@@ -9,16 +9,17 @@ All are solved with the default settings from nothing, on one thread:
   `batched` and by `ipopt`. Some of these models are unstable in contact, and actions at their bounds cannot hold them.
 
 Printed per size: the share of problems solved, iterations of one start on average (most are given up after a few), and
-CPU time per problem. Written as JSON too.
+CPU time per problem. Written as JSON too. `--hand 4` prints times of plans of a hand instead.
 """
 
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import tyro
 from models import Instance, chain, chain_of_carts, pushing, pushing_model, random_model, to_rest
@@ -26,6 +27,11 @@ from models import Instance, chain, chain_of_carts, pushing, pushing_model, rand
 from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save, smoke_path
 from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
+from difflcs.mpc.solution import Primal
+from difflcs.physics.mujoco import ContactGroup
+from difflcs_envs.hand.env import HandTurnObjectEnv
+from difflcs_envs.hand.model import FINGERS, LINKS
+from difflcs_envs.tasks import hand_cost, hand_system
 
 # n_x, n_lam, H
 RANDOM = [
@@ -36,6 +42,15 @@ CARTS = [(carts, horizon) for carts in (2, 4, 10, 20) for horizon in (10, 20, 40
 WEAK = {"random, weak": random_model, "pushing, weak": pushing_model}
 HORIZONS, WEAK_MODELS, WEAK_PROBLEMS = (10, 20, 30), 24, 8
 BACKENDS: dict[str, Backend] = {"batched": BatchedBackend(threads=1), "ipopt": IpoptBackend(workers=1)}
+# Plans of a hand: options of the solver, whether from the last plan, whether all in one call, and the relaxation.
+HAND: dict[str, tuple[dict[str, Any], bool, bool, float]] = {
+    'from nothing, "fast"': ({"effort": "fast"}, False, False, 1e-3),
+    'from nothing, "default"': ({}, False, False, 1e-3),
+    "from the last plan": ({"restarts": 1}, True, False, 1e-3),
+    "from the last plan, 1e-7": ({"restarts": 1}, True, False, 1e-7),
+    "in a batch, from nothing, one start": ({"restarts": 1}, False, True, 1e-3),
+    "in a batch, from the last plan": ({"restarts": 1}, True, True, 1e-3),
+}
 
 
 @dataclass
@@ -46,6 +61,8 @@ class Options:
     """Problems per model of the first two families."""
     seeds: int = 4
     """Models of each size; the carts have one."""
+    hand: int = 0
+    """Closed loops of a hand, of 8 states each, whose plans are timed instead."""
     out: Path = Path("benchmarks/results/scale.json")
     """Path of the JSON output."""
     smoke: bool = False
@@ -78,9 +95,41 @@ def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]
     return row
 
 
+@torch.no_grad()
+def time_hand(loops: int, limits: int | None, each: int) -> None:
+    """Print CPU milliseconds of plans of a hand with so many contacts of a finger."""
+    env, met = HandTurnObjectEnv(), []
+    groups = [ContactGroup([("object", f"{finger}_{link}") for link in LINKS], each) for finger in FINGERS]
+    groups += [ContactGroup(("object", "palm"), 2 + each // 2), ContactGroup(None, 2 * each, False, 0.006)]
+    system = hand_system(env.model, contacts=groups, limits=limits)
+    layer = LCSMPCLayer(system, hand_cost(system), 4, -0.05, 0.05, relaxation=1e-3, on_failure="mask")
+    for seed in range(loops):
+        goal, plan = torch.from_numpy(env.reset(seed=seed)[0]["goal"]), None
+        for _ in range(9):
+            x, guess = system.observe(env.data), plan and plan.shift()
+            met += [(x, goal, *guess[:3])] if guess else []
+            plan = layer(x, goal, guess=guess)
+            env.step(plan.action.numpy())
+    x, goal, *last = (torch.stack(values) for values in zip(*met, strict=True))
+    problem = layer(x, goal).problem
+    for name, (options, warm, batch, relaxation) in HAND.items():
+        backend, ms = BatchedBackend(threads=1, **options), []
+        for part in torch.arange(len(x)).split(len(x) if batch else 1):
+            asked = replace(problem.select(part), relaxation=relaxation)
+            guess = Primal(*(v[part] for v in last), x.new_zeros(len(part), 5, 0)) if warm else None
+            begun = time.process_time()
+            backend.solve(asked, guess)
+            ms.append(1e3 * (time.process_time() - begun) / len(part))
+        print(f"{asked.n_lam} forces, {name}: mean {np.mean(ms):.2f}, median {np.median(ms):.2f}, most {max(ms):.1f}")
+
+
 def main(o: Options) -> None:
     """Measure, print, write."""
     torch.set_num_threads(1)
+    if o.hand:
+        for limits, each in ((0, 2), (None, 2), (0, 4)):
+            time_hand(o.hand, limits, each)
+        return
     warnings.simplefilter("ignore")  # what fails is counted
     random, carts, horizons, models, few = RANDOM, CARTS, HORIZONS, WEAK_MODELS, WEAK_PROBLEMS
     if o.smoke:
