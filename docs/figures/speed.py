@@ -1,4 +1,4 @@
-"""Draws speed.png from benchmarks/results/race.json: times of the fastest rival over ours.
+"""Draws speed.png from benchmarks/results/race_avx512.json: times of the fastest rival over ours.
 
 `python docs/figures/speed.py`
 """
@@ -14,7 +14,7 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
-RECORD = HERE.parents[1] / "benchmarks" / "results" / "race.json"
+RECORD = HERE.parents[1] / "benchmarks" / "results" / "race_avx512.json"
 WAYS = {"batch": ("256 problems in one call", "#1f6f8b"), "one": ("one problem a call", "#d98032")}
 
 
