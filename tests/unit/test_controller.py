@@ -238,14 +238,14 @@ def test_a_module_whose_system_changes_its_form_or_breaks_is_refused(build, chan
     if change == "sequence":
         other = LCSSequence.stack([other] * H)
     elif change == "size":
-        other = build.params(0, n_lam=2)
+        mpc.lcs.n_lam, other = 2, build.params(0, n_lam=2)
     else:
         (other.A if change == "NaN" else other.F).numpy()[0, 0] = np.nan if change == "NaN" else -1.0
     mpc.lcs.params = lambda x, context: other
     if change in ("F in place", "NaN"):
         refuse(InvalidInputError, r"F \+ Fᵀ pos|A: expected finite", mpc.controller().step, x)
     refuse(InvalidInputError, r"expected (. \(.*as in the first|F \+ Fᵀ pos|finite).*; ", controller.step, x)
-    mpc.lcs.params = plain
+    mpc.lcs.params, mpc.lcs.n_lam = plain, Leaning.n_lam
     controller.reset()
     assert np.array_equal(controller.step(x), before)
 
