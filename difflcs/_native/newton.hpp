@@ -31,11 +31,11 @@ class Solver {
     Stages<Matrix<Vec, S::kU, S::kX>> feedback;
   } law, origin;  // of the next step, and the one around x = 0 where that is kept
   Vec *newton, *dx, *du;
-  const Mask large;  // in all lanes, where forces on the way of the homotopy need not be exact
+  const Mask large = batch.large() ? ~Mask{} : Mask{};  // where forces on the way of the homotopy need not be exact
   Mask* rows;
 
  public:
-  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), progress(b, problem), large(b.large() ? ~Mask{} : Mask{}) {
+  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), progress(b, problem) {
     layout(memory);
   }
 

@@ -341,7 +341,7 @@ struct Progress {
     }
   }
 
-  // Relaxation of the next stage of a lane. A stage that is solved `at_once`, before its first step, leads as far as four.
+  // Relaxation of the next stage of a lane. A stage solved `at_once`, before its first step, leads as far as four.
   double next_stage(const MpcSolve& o, int l, bool at_once) const {
     double shrink = o.shrink;
     if (at_once) {

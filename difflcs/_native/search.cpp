@@ -35,7 +35,7 @@ constexpr int64_t kNear = 2;
 // If of half of the starts, kHalf for each action at least, one in kFound finds the best plan and at most one in kLone
 // ends where no other does, to kEqual of their cost, the search is over: what many find is rarely not the best. Four
 // that agree so are spared the local search. Starts after the first kFixed are left where they seem not to come below the
-// best cost by this part of it. A start of problems that are solved one by one costs as much as the first: of theirs kBrief
+// best cost by this part of it. A start of problems solved one by one costs as much as the first: of theirs kBrief
 // are enough, whatever the number of actions, and the local search ends with the first round in vain, unless contacts are
 // sought for long at last.
 constexpr int64_t kHalf = 8, kBrief = 6, kFound = 4, kLeastFound = 2, kLone = 8, kMostLone = 1;
