@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from push_t import Rigid
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from successes import success_figures
 from torch import Tensor
 
 from difflcs import Animation, GoalCost, LCSMPCLayer, Status
@@ -47,7 +48,6 @@ from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, Mode, SamplingPolicy, SamplingSettings, Workspace
 from difflcs.planning.outline import DistanceGrid, clearance, ring
 from difflcs.planning.places import from_body
-from difflcs.rl import wilson_interval
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -672,12 +672,8 @@ def figures(played: list[Played], alone: list[Played], bodies: int) -> dict[str,
     solved = np.array([one.success for one in played])
     mean_alone = float(np.mean([one.steps for one in alone]))
     within = solved & (steps <= 2 * bodies * mean_alone)
-    low, high = wilson_interval(int(within.sum()), len(within))
     return {
-        "success_rate": float(within.mean()),
-        "ci_low": low,
-        "ci_high": high,
-        "episodes": len(played),
+        **success_figures(within.astype(float)),
         "solved": int(solved.sum()),
         "mean_steps": float(steps.mean()),
         "longest": int(steps.max()),

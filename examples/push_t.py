@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -435,6 +435,64 @@ def export(directory: Path) -> None:
     }
     lines = (" ".join([name, *map(repr, np.ravel(value).tolist())]) for name, value in values.items())
     (directory / "push_t.txt").write_text("\n".join(lines) + "\n")
+
+
+class Episode(NamedTuple):
+    """One episode.
+
+    Attributes:
+        success: the environment's flag.
+        steps: until success or the limit.
+        coverage: largest part of the goal that the T has covered.
+        milliseconds: CPU time of the policy, of all steps.
+    """
+
+    success: bool
+    steps: int
+    coverage: float
+    milliseconds: float
+
+
+def play(
+    env: Any,
+    policy: DiscPolicy,
+    seed: int,
+    limit: int = STEPS,
+    *,
+    noise: float = 0.0,
+    delay: int = 0,
+    friction: float = 0.0,
+) -> Episode:
+    """Play one episode of a seed.
+
+    Args:
+        env: of `make_env`, or another with such observations, actions and information.
+        policy: whose CPU time is measured.
+        seed: of the episode, and of the noise.
+        limit: steps after which it ends.
+        noise: standard deviation of every observed coordinate [px].
+        delay: steps by which the actions come late.
+        friction: of disc and body in the environment, which has none.
+    """
+    random = np.random.default_rng([seed, 2])
+    spread = noise * np.array([1.0, 1.0, 1.0, 1.0, 1.0 / (GYRATION * PIXELS)])
+    observation, _ = env.reset(seed=seed)
+    if friction:
+        for shape in env.unwrapped.agent.shapes | env.unwrapped.block.shapes:
+            shape.friction = friction**0.5  # pymunk multiplies both
+    policy.reset()
+    late = [observation[:2].copy()] * delay
+    times, best, success = [], 0.0, False
+    for _ in range(limit):
+        seen = observation + spread * random.standard_normal(5)
+        start = time.process_time()
+        late.append(policy.act(seen))
+        times.append(1e3 * (time.process_time() - start))
+        observation, _, success, truncated, info = env.step(late.pop(0))
+        best = max(best, float(info["coverage"]))
+        if success or truncated:
+            break
+    return Episode(bool(success), len(times), best, sum(times))
 
 
 class Simulated:

@@ -32,7 +32,6 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from successes import success_figures, success_text
 
 from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
@@ -40,6 +39,7 @@ from difflcs.errors import ContactWarning, InvalidInputError
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 from allegro_turn import OBJECTS, SECONDS, HandPolicy, Settings, make_task
 from recorded import Recorded
+from successes import success_figures, success_text
 from trifinger_turn import yaw_quaternion
 
 COLUMNS = "object", "seed", "success", "placed", "dropped", "steps", "position_mm", "angle_deg", "goals"

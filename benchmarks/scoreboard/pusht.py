@@ -19,23 +19,22 @@ again: after a change of the policy begin another file. `--variant all` plays al
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 import tyro
-from successes import success_figures, success_text
 
 from difflcs.cli.bench import machine, save
 from difflcs.errors import InvalidInputError
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 from learn_push import learn
-from push_t import CENTER_OF_MASS, DRIVE, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
+from push_t import CENTER_OF_MASS, DRIVE, GYRATION, STEPS, PushTPolicy, make_env, play, tee, tee_pushing
+from successes import success_figures, success_text
 
 
 @dataclass(frozen=True)
@@ -99,50 +98,12 @@ class Options:
     """Two episodes of a few steps."""
 
 
-class Episode(NamedTuple):
-    """One episode.
-
-    Attributes:
-        success: the environment's flag.
-        steps: until success or the limit.
-        coverage: largest part of the goal that the T has covered.
-        milliseconds: CPU time of the policy, of all steps.
-    """
-
-    success: bool
-    steps: int
-    coverage: float
-    milliseconds: float
-
-
-def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:
-    """Play one episode of a seed."""
-    noise = np.random.default_rng([seed, 2])
-    spread = variant.noise * np.array([1.0, 1.0, 1.0, 1.0, 1.0 / (GYRATION * PIXELS)])
-    observation, _ = env.reset(seed=seed)
-    if variant.friction:
-        for shape in env.unwrapped.agent.shapes | env.unwrapped.block.shapes:
-            shape.friction = variant.friction**0.5  # pymunk multiplies both
-    policy.reset()
-    late = [observation[:2].copy()] * variant.delay
-    times, best, success = [], 0.0, False
-    for _ in range(limit):
-        seen = observation + spread * noise.standard_normal(5)
-        start = time.process_time()
-        late.append(policy.act(seen))
-        times.append(1e3 * (time.process_time() - start))
-        observation, _, success, truncated, info = env.step(late.pop(0))
-        best = max(best, float(info["coverage"]))
-        if success or truncated:
-            break
-    return Episode(bool(success), len(times), best, sum(times))
-
-
 def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
     """Compute the figures of a variant."""
     policy, limit = variant.policy(o.seed), 5 if o.smoke else STEPS
     policy.adapts = o.adapt
-    episodes = [play(env, policy, o.seed + i, variant, limit) for i in range(o.episodes)]
+    changes = {name: getattr(variant, name) for name in ("noise", "delay", "friction")}
+    episodes = [play(env, policy, o.seed + i, limit, **changes) for i in range(o.episodes)]
     success, steps, coverage, milliseconds = np.array(episodes, float).T
     return {
         **success_figures(success),

@@ -29,7 +29,7 @@ from difflcs_envs.rendering import select_gl_backend
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
-sys.path += [str(ROOT / "benchmarks" / "scoreboard"), str(ROOT / "examples")]
+sys.path.append(str(ROOT / "examples"))
 WIDTH, HEIGHT = 280, 210
 
 select_gl_backend()  # before MuJoCo is imported, by what is imported in the functions below
@@ -91,8 +91,7 @@ def pushany(o: Options) -> None:
 
 def fetch(task: str, seeds: range) -> list[np.ndarray]:
     """Frames of FetchPush or FetchSlide, every second step of 0.04 s."""
-    from fetch import make_env
-    from fetch_policies import STEPS, PushPolicy, SlidePolicy
+    from fetch_policies import STEPS, PushPolicy, SlidePolicy, make_env
 
     env = make_env(task)
     model, posture = env.unwrapped.model, env.unwrapped.initial_qpos

@@ -87,16 +87,15 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(capsys, tmp_pat
 @pytest.mark.slow  # plays
 def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(capsys):
     import push_any
-    import pushany
 
-    pushany.main(pushany.Options(json=True, smoke=True, obstacles=2))
+    push_any.main(push_any.Options(json=True, smoke=True, obstacles=2))
     assert set(line_of(capsys)) >= KEYS - {"coverage"}
     shapes = {"t": 1, "0": 2, "4": 1, "5": 2, "rectangle": 2, "reg7": 7}
     for name, turns in shapes.items():
-        env = pushany.StateEnv(object_name=name)
+        env = push_any.StateEnv(object_name=name)
         env.reset(seed=0)
         assert push_any.count_turns(env.block, push_any.pushing(env.block)[1]) == turns
-    seeds = pushany.find_seeds(pushany.Options(3, obstacles=2))
+    seeds = push_any.find_seeds(push_any.Options(3, obstacles=2))
     for seed in seeds:
         env.reset(seed=seed)
         assert len(env.obstacles) == 2

@@ -1,4 +1,4 @@
-"""The cube of trifinger-rl-datasets pushed to a place: `python benchmarks/scoreboard/trifinger_rl.py --episodes 64`.
+"""The cube of trifinger-rl-datasets pushed to a place: `python examples/trifinger_rl.py --episodes 64`.
 
 Simulator, task, reward and evaluation are those of the authors (`trifinger_rl_datasets.Evaluation`, PyBullet, torques
 at 50 Hz that act 10 ms late, a pose of the cube that is 90 to 190 ms old, 750 steps). Only the random numbers are
@@ -15,10 +15,12 @@ The reward of a step is sech²(15 d), with d [m] the distance of the cube's cent
 Times are CPU times of the policy. The record of a policy is written after each episode.
 """
 
+# The simulator and its packages are no dependency.
+# pyright: reportMissingImports=false
+
 import contextlib
 import io
 import json
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +34,6 @@ from successes import success_figures
 from difflcs.cli.bench import machine, save
 from difflcs.errors import MissingDependencyError
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
 OWN = "contact-mpc"
 KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
 """Of the statistics of an episode, as the evaluation calls them."""

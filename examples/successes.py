@@ -1,4 +1,4 @@
-"""Success figures that every scoreboard reports."""
+"""Success figures that programs report which play benchmarks of others."""
 
 from typing import Any
 
