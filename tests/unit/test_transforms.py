@@ -1,9 +1,12 @@
 """solve_lcp, the losses, the layer and the records under torch.func, vectorised jacobians and torch.compile."""
 
+import warnings
+from functools import partial
+
 import pytest
 import torch
 from torch.autograd.functional import jacobian
-from torch.func import functional_call, grad, jacrev, vjp, vmap
+from torch.func import functional_call, grad, jacrev, jvp, vjp, vmap
 
 from difflcs import (
     LCSMPCLayer,
@@ -16,7 +19,10 @@ from difflcs import (
     solve_lcp,
     violation_loss,
 )
-from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
+from difflcs import errors as e
+from difflcs.cli.bench import pushing_model
+from difflcs.mpc import Primal
+from difflcs.systems import pushing_cost
 from tests.conftest import refuse
 
 COUNT = 6
@@ -37,6 +43,29 @@ def lcps(build):
 def data(build):
     n = build.normal(5)
     return n(COUNT, 4), n(COUNT, 2), n(COUNT, 4)
+
+
+@pytest.fixture
+def layer(build):
+    return LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
+
+
+@pytest.fixture
+def x0(data):
+    return 0.2 * data[0]
+
+
+@pytest.fixture
+def systems(build):
+    """One system per element."""
+    n = build.normal(1)
+    return {k: v.expand(6, *v.shape) + 1e-2 * n(6, *v.shape) for k, v in build.lcs_tensors(3).items() if k != "F"} | {
+        "F": build.lcs_tensors(3)["F"].expand(6, 3, 3).clone()
+    }
+
+
+def close(found, expected):
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11, check_stride=False)
 
 
 # --- solve_lcp ------------------------------------------------------------------------------------------------------
@@ -82,7 +111,7 @@ every_function = pytest.mark.parametrize("what", FUNCTIONS)
 
 
 @pytest.fixture
-def function(build, lcps, data, what):
+def function(build, lcps, data, layer, what):
     """A function of one tensor, and where to evaluate it."""
     (F, q), (x, u, x_next), model = lcps, data, build.model(seed=3)
     if "LCP" in what:
@@ -90,7 +119,6 @@ def function(build, lcps, data, what):
         F = F[0] if "shared" in what else F
         return (lambda F: solve_lcp(F, q).lam, F[0]) if "F" in what else (lambda q: solve_lcp(F, q, relaxation).lam, q)
     if what == "layer":
-        layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
         return lambda x: layer(x).action, 0.2 * x
     lcs = {"model": model, "shared": model.params().detach(), "each": build.params(seed=3, batch=(COUNT,))}[what]
     return lambda x: violation_loss(lcs, x, u, x_next, 0.02, 0.3, reduction="none"), x
@@ -105,7 +133,7 @@ def test_every_way_to_a_jacobian_gives_the_same(function):
     basis = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
     rows = torch.stack([pull(row)[0] for row in basis]).reshape(expected.shape)
     for found in (jacobian(of, at, vectorize=True), jacrev(of)(at), jacrev(of, chunk_size=1)(at), rows):
-        torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-11)
+        close(found.detach(), expected)
 
 
 @pytest.mark.parametrize("what", ["shared LCP", "shared relaxed LCP", "layer"])
@@ -119,11 +147,11 @@ def test_vmap_is_a_batch_and_grad_is_backward(function):
     fold, grid = (lambda v: v.flatten(0, 1)), at.reshape(2, 3, 4)
     values = [vmap(of)(at), vmap(of, 1)(at.T), vmap(of, out_dims=1)(at).mT, vmap(of, chunk_size=4)(at)]
     for found in (*values, fold(vmap(of)(grid)), fold(vmap(vmap(of))(grid))):
-        torch.testing.assert_close(found.detach(), plain, rtol=1e-9, atol=1e-11, check_stride=False)
+        close(found.detach(), plain)
     mapped = torch.autograd.grad(vmap(total)(leaf).sum(), leaf)[0]
     slopes = [grad(total)(at), vmap(grad(total))(at), grad(lambda z: vmap(total)(z).sum())(at), mapped]
     for found in (*slopes, fold(vmap(vmap(grad(total)))(grid)), vmap(grad(total), 1, 1)(at.T).T):
-        torch.testing.assert_close(found, slope, rtol=1e-9, atol=1e-11, check_stride=False)
+        close(found, slope)
 
 
 def test_gradients_of_problems_sum_to_that_of_the_matrix_that_they_share(lcps):
@@ -145,7 +173,7 @@ def test_batched_gradients_of_a_graph_that_was_made_before(build, function):
     (many,) = torch.autograd.grad(value, at, upstream, is_grads_batched=True, retain_graph=True)
     for k in range(5):
         (one,) = torch.autograd.grad(value, at, upstream[k], retain_graph=True)
-        torch.testing.assert_close(many[k], one, rtol=1e-9, atol=1e-11)
+        close(many[k], one)
 
 
 @pytest.mark.parametrize("how", REFUSED)
@@ -153,28 +181,17 @@ def test_batched_gradients_of_a_graph_that_was_made_before(build, function):
 def test_second_derivatives_are_refused_everywhere(function, what, how):
     of, at = function
     name = {"LCP by q": "solve_lcp", "layer": "LCSMPCLayer"}.get(what, "violation_loss")
-    with pytest.raises(DoubleBackwardError, match=rf"{name} has first derivatives only; expected create_graph=False"):
+    with pytest.raises(e.DoubleBackwardError, match=rf"{name} has first derivatives only; expected create_graph=False"):
         REFUSED[how](of, at.clone())
-
-
-def test_numbers_that_are_hidden_from_the_checks_are_checked_by_the_solver(lcps):
-    F, q = lcps
-    q = q.clone()
-    q[3, 1] = torch.nan
-    with pytest.raises(NonFiniteError, match=r"q: expected finite numbers, got 1 .* at index \(3, 1\)"):
-        vmap(lambda q: solve_lcp(F[0], q).lam)(q)
-    F = F.clone()
-    F[1, 0, 0] = torch.inf
-    refuse(NonFiniteError, "F: expected finite numbers, got 1", grad(lambda F: solve_lcp(F, lcps[1]).lam.sum()), F)
 
 
 def test_a_failure_under_vmap_warns_and_has_no_gradient(lcps):
     F, q = lcps[0].clone(), lcps[1].clone()
     F[2], q[2] = -torch.eye(4), -1.0
-    with pytest.warns(SolveWarning, match="1 of 6 LCPs were not solved"):
+    with pytest.warns(e.SolveWarning, match="1 of 6 LCPs were not solved"):
         status = vmap(lambda F, q: solve_lcp(F, q).status)(F, q)
     assert (status != Status.CONVERGED).tolist() == [i == 2 for i in range(COUNT)]
-    with pytest.warns(SolveWarning):
+    with pytest.warns(e.SolveWarning):
         found = vmap(grad(lambda q, F: solve_lcp(F, q).lam.sum()))(q, F)
     assert float(found[2].abs().max()) == 0
     assert torch.equal(found[1], grad(lambda q: solve_lcp(F[1], q).lam.sum())(q[1]))
@@ -235,20 +252,135 @@ def test_an_ensemble_of_models_is_mapped(build, data, gamma):
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
 
 
-def test_what_vmap_hides_from_the_records_is_checked_by_the_loss(build, data):
-    params = build.params(seed=3)
-    F = torch.stack([params.F, -params.F, params.F])
+# --- the layer ------------------------------------------------------------------------------------------------------
 
-    def of(F):
-        return violation_loss(LCSParams(**{**params.tensors(), "F": F}), *data, 0.05)
 
-    refuse(NotPositiveDefiniteError, "expected F \\+ Fᵀ positive definite", vmap(of), F)
-    with pytest.raises(GammaError, match="0 < gamma <= sigma_min"):
-        vmap(lambda F: violation_loss(LCSParams(**{**params.tensors(), "F": F}), *data, 1e3))(F[[0, 2]])
-    x = data[0].clone()
-    x[2, 3] = torch.nan
-    with pytest.raises(NonFiniteError, match="x: expected finite numbers, got 1"):
-        vmap(lambda x, u, y: violation_loss(params, x, u, y))(x, *data[1:])
+def test_vmap_over_systems_states_and_both(build, layer, x0, systems):
+    own = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+
+    def plan(system, x):
+        return own(x, lcs=LCSParams(**system)).u
+
+    close(vmap(plan)(systems, x0), own(x0, lcs=LCSParams(**systems)).u)
+    one = {k: v[2] for k, v in systems.items()}
+    close(vmap(plan, in_dims=(None, 0))(one, x0), own(x0, lcs=LCSParams(**one)).u)
+    close(vmap(plan, in_dims=(0, None))(systems, x0[1]), own(x0[1], lcs=LCSParams(**systems)).u)
+    # Every system with every state: a mapped dimension beside one of the batch.
+    grid = vmap(plan, in_dims=(0, None))(systems, x0)
+    for i in (0, 4):
+        close(grid[i], own(x0, lcs=LCSParams(**{k: v[i] for k, v in systems.items()})).u)
+
+
+def test_vmap_over_guesses_bounds_and_goals(build, layer, x0):
+    limit = torch.linspace(0.01, 0.1, 6, dtype=torch.float64)[:, None].expand(6, 2)
+    close(vmap(lambda x, b: layer(x, u_min=-b, u_max=b).u)(x0, limit), layer(x0, u_min=-limit, u_max=limit).u)
+    sol = layer(x0)
+    warm = vmap(lambda x, *g: layer(x, guess=Primal(*g)).iterations)(x0, sol.x, sol.u, sol.lam)
+    assert torch.equal(warm, layer(x0, guess=sol).iterations)
+    assert int(warm.sum()) < int(sol.iterations.sum())
+    pusher = LCSMPCLayer(pushing_model(5, 0), pushing_cost(), 2, -0.015, 0.015, relaxation=1e-4)
+    n = build.normal(2)
+    x, goal, reference = 0.05 * n(3, 9), 0.05 * n(4, 3), 0.05 * n(4, 3, 3)
+    close(vmap(lambda g: pusher(x, g).u)(goal), pusher(x, goal[:, None]).u)
+    close(vmap(lambda r: pusher(x, reference=r).u)(reference), pusher(x, reference=reference[:, None]).u)
+
+
+def test_numbers_that_a_transform_hides_from_the_checks_are_checked_inside(build, lcps, data, layer, x0, systems):
+    (F, q), shared, limit = lcps, build.params(seed=3), torch.full((3, 2), 0.1).double()
+    signs = torch.tensor([1.0, -1.0, 1.0]).double()[:, None, None]
+
+    def spoilt(value, *index, number=torch.nan):
+        return value.index_put(tuple(map(torch.tensor, index)), torch.tensor(number, dtype=value.dtype))
+
+    def loss(F, x=data[0], gamma=0.05):
+        return violation_loss(LCSParams(**{**shared.tensors(), "F": F}), x, *data[1:], gamma)
+
+    def plan(system, x):
+        return layer(x, lcs=LCSParams(**system)).u
+
+    lcp, of_F = vmap(lambda q: solve_lcp(F[0], q).lam), grad(lambda F: solve_lcp(F, q).lam.sum())
+    refuse(e.NonFiniteError, r"q: expected finite numbers, got 1 .* at index \(3, 1\)", lcp, spoilt(q, 3, 1))
+    refuse(e.NonFiniteError, "F: expected finite numbers, got 1", of_F, spoilt(F, 1, 0, 0, number=torch.inf))
+    refuse(e.NotPositiveDefiniteError, r"expected F \+ Fᵀ positive definite", vmap(loss), signs * shared.F)
+    refuse(e.GammaError, "0 < gamma <= sigma_min", vmap(partial(loss, gamma=1e3)), shared.F.expand(2, 3, 3))
+    refuse(
+        e.NonFiniteError,
+        "x: expected finite numbers, got 1",
+        vmap(partial(loss, shared.F)),
+        spoilt(data[0], 2, 3)[None],
+    )
+    nan, negative = systems | {"A": torch.nan * systems["A"]}, systems | {"F": -systems["F"]}
+    refuse(e.NonFiniteError, "A: expected finite numbers, got 96 NaN", vmap(plan), nan, x0)
+    refuse(e.NotPositiveDefiniteError, r"F \+ Fᵀ positive definite", vmap(plan), negative, x0)
+    refuse(e.NonFiniteError, "x0: expected finite numbers", vmap(lambda x: layer(x).u), x0 * torch.inf)
+    refuse(e.BoundsError, "u_min <= u_max", vmap(lambda b: layer(x0, u_min=b, u_max=-b).u), limit)
+    refuse(e.NonFiniteError, "u_max: expected numbers or inf", vmap(lambda b: layer(x0, u_max=b).u), torch.nan * limit)
+
+
+def test_failures_are_reported_inside(layer, x0):
+    far = torch.full((4,), 1e200, dtype=torch.float64)
+    bad = torch.stack([x0[0], far, x0[2]])
+    with pytest.raises(e.SolveError, match=r"1 of 3 MPC problems were not solved.*elements 1") as error:
+        vmap(lambda x: layer(x).u)(bad)
+    assert error.value.elements == (1,)
+    layer.on_failure = "mask"
+    with pytest.warns(e.SolveWarning, match="1 of 3"):
+        status = vmap(lambda x: layer(x).status)(bad)
+    assert status[0] == status[2] == Status.CONVERGED != status[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", e.SolveWarning)
+        found = vmap(grad(lambda x: layer(x).u.sum()))(bad)
+    assert torch.equal(found[1], torch.zeros(4, dtype=torch.float64))
+    assert float(found[[0, 2]].detach().abs().amax(1).min()) > 0
+
+
+def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):
+    """The gradient of the objective does not move linearly with x0; a constant would be wrong in silence."""
+    refuse(e.DoubleBackwardError, ".", grad(lambda x: grad(lambda y: layer(y).objective)(x).sum()), x0[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode
+@pytest.mark.parametrize("learnable", [True, False])
+def test_forward_mode_is_refused_whatever_requires_a_gradient(layer, x0, learnable):
+    """A tangent that is dropped would be a derivative without the part of the plan."""
+    system = layer.lcs if learnable else layer.lcs.params().detach()
+    mpc = LCSMPCLayer(system, layer.cost, layer.horizon, u_min=-1.0, u_max=1.0)
+    with torch.no_grad():
+        mpc(x0)  # what it remembers is not used either
+    with torch.no_grad(), torch.autograd.forward_ad.dual_level():
+        with pytest.raises(NotImplementedError, match="forward-mode"):
+            mpc(torch.autograd.forward_ad.make_dual(x0, torch.ones_like(x0)))
+        assert mpc(x0).converged.all()  # without a tangent there is nothing to lose
+    with pytest.raises(NotImplementedError, match="forward"):
+        jacobian(lambda x: mpc(x).u, x0, strategy="forward-mode", vectorize=True)
+    with pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        jvp(lambda x: mpc(x).u, (x0,), (x0,))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_a_graph_that_cannot_hold_a_solver_is_refused(layer, x0):
+    for trace in (partial(torch.export.export, strict=False), torch.jit.trace):
+        with pytest.raises(NotImplementedError, match=r"got torch\.export, torch\.jit\.trace or the like"):
+            trace(layer, (x0,))
+
+
+def test_what_was_made_in_inference_mode_serves_where_gradients_are_recorded(layer, x0):
+    with torch.inference_mode():
+        states, guess = x0.clone(), layer(x0)
+    found, expected = layer(states, guess=guess).u, layer(x0, guess=layer(x0)).u
+    close(
+        *(torch.autograd.grad(u.square().sum(), list(layer.parameters()), allow_unused=True) for u in (found, expected))
+    )
+
+
+def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
+    plan = layer(x0)
+    before = plan.complementarity(), plan.dynamics_residual()
+    with torch.no_grad():  # a step of an optimiser
+        for p in layer.parameters():
+            p.mul_(1.1)
+    assert torch.equal(plan.complementarity(), before[0])
+    assert torch.equal(plan.dynamics_residual(), before[1])
 
 
 # --- records --------------------------------------------------------------------------------------------------------
@@ -280,9 +412,8 @@ def test_steps_and_rollouts_of_records_are_mapped(build):
 @pytest.mark.slow
 # Where warnings are errors, the compiler trips over one of its own, which it otherwise hides.
 @pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
-def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, data):
+def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, data, layer):
     model, params = build.model(seed=3), build.params(seed=3, batch=(COUNT,))
-    layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
     fields, (F, q), (x, u, x_next) = params.tensors(), lcps, data
 
     def function(q, x):
