@@ -43,6 +43,8 @@ constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
 // A bound that is this many times farther than that plan counts as none.
 constexpr double kReach = 3.0, kNone = 100.0;
+// Directions of a cost's weights below this part of the largest count as flat. Objectives equal to this part are the same.
+constexpr double kFlat = 1e-12, kRounded = 1e-9;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
 // Starts are searched in groups, each with a local search of its own: what one group ends in depends on where it began,
@@ -220,22 +222,37 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   return p;
 }
 
-// The objective below which a job must come that is to be better than a plan, by more than kEqual.
-double needed(double objective) { return objective - kEqual * std::abs(objective); }
+// How many of `count` starts, which reached these objectives, found one of them, of this size.
+int64_t finders(const double* reached, int64_t count, double one, double size) {
+  return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * size; });
+}
 
-// How many of `count` starts, which reached these objectives, found one of them.
-int64_t finders(const double* reached, int64_t count, double one) {
-  return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * std::abs(one); });
+// The least value of z'Wz / 2 + w'z where W is positive semidefinite, along the directions in which it is positive. Its
+// lower triangle and w are overwritten.
+double least_value(int64_t n, double* W, double* w) {
+  double value = 0.0, largest = 0.0;
+  for (int64_t i = 0; i < n; i++) largest = std::max(largest, W[i * n + i]);
+  for (int64_t i = 0; i < n; i++) {
+    const double pivot = W[i * n + i];
+    if (!(pivot > kFlat * largest)) continue;
+    value -= 0.5 * w[i] * w[i] / pivot;
+    for (int64_t j = i + 1; j < n; j++) {
+      const double part = W[j * n + i] / pivot;
+      w[j] -= part * w[i];
+      for (int64_t l = i + 1; l <= j && part != 0; l++) W[j * n + l] -= part * W[l * n + i];
+    }
+  }
+  return value;
 }
 
 // Rounds that the local search of a long plan has besides those in vain that end it.
 int64_t longer(const MpcBatch& b, int64_t starts) { return starts * std::min(b.horizon, kLong) / kLong; }
 
-// Whether `count` starts, which reached these objectives, make others unnecessary.
-bool settled(const double* reached, int64_t count) {
-  const int64_t found = finders(reached, count, *std::min_element(reached, reached + count));
+// Whether `count` starts, which reached these objectives, the least of this size, make others unnecessary.
+bool settled(const double* reached, int64_t count, double size) {
+  const int64_t found = finders(reached, count, *std::min_element(reached, reached + count), size);
   int64_t lone = 0;
-  for (int64_t i = 0; i < count; i++) lone += finders(reached, count, reached[i]) == 1;
+  for (int64_t i = 0; i < count; i++) lone += finders(reached, count, reached[i], size) == 1;
   return found >= std::max(kLeastFound, count / kFound) && lone <= std::max(kMostLone, count / kLone);
 }
 
@@ -285,7 +302,40 @@ void MpcSearch::reserve(const MpcBatch& batch, const MpcEffort& effort) {
   origin.reserve(jobs);
   dearer.reserve(batch.count);
   closing.reserve(2 * batch.n_x);
+  lowest.reserve(batch.count);
+  weight.reserve((batch.n_x + batch.n_u) * (batch.n_x + batch.n_u));
+  slope.reserve(batch.n_x + batch.n_u);
 }
+
+// What the costs of the stages of element e sum to at least, whatever the dynamics.
+double MpcSearch::least_cost(const MpcBatch& b, int64_t e) {
+  const int64_t n_x = b.n_x, n_u = b.n_u, n = n_x + n_u;
+  weight.resize(n * n);
+  slope.resize(n);
+  const bool same = b.step[kQ] + b.step[kR] + b.step[kS] + b.step[kq] + b.step[kr] == 0;
+  double sum = 0.0;
+  for (int64_t k = 0; k < (same ? 1 : b.horizon); k++) {
+    const double *Q = b.at(kQ, e, k), *R = b.at(kR, e, k), *S = b.at(kS, e, k);
+    for (int64_t i = 0; i < n_x; i++) std::copy_n(Q + i * n_x, n_x, weight.data() + i * n);
+    for (int64_t i = 0; i < n_u; i++) {
+      double* row = weight.data() + (n_x + i) * n;
+      for (int64_t j = 0; j < n_x; j++) row[j] = S[j * n_u + i];
+      std::copy_n(R + i * n_u, n_u, row + n_x);
+    }
+    std::copy_n(b.at(kq, e, k), n_x, slope.data());
+    std::copy_n(b.at(kr, e, k), n_u, slope.data() + n_x);
+    sum += least_value(n, weight.data(), slope.data());
+  }
+  std::copy_n(b.at(kQ_final, e), n_x * n_x, weight.data());
+  std::copy_n(b.at(kq_final, e), n_x, slope.data());
+  return (same ? double(b.horizon) : 1.0) * sum + least_value(n_x, weight.data(), slope.data());
+}
+
+double MpcSearch::size(int64_t e, double objective) const {
+  return std::min(std::abs(objective), std::max(objective - lowest[e], kRounded * std::abs(objective)));
+}
+
+double MpcSearch::needed(int64_t e, double objective) const { return objective - kEqual * size(e, objective); }
 
 // Calls the kernel for every problem of a batch.
 void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
@@ -417,6 +467,8 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
   std::fill_n(to.iterations, count, 0);
   std::fill_n(to.objective, count, std::numeric_limits<double>::max());
   for (auto* v : {&agreed, &found, &ended}) v->assign(count, 0);
+  lowest.resize(count);
+  for (int64_t e = 0; e < count; e++) lowest[e] = least_cost(batch, first + e);
   members.resize(count);
   std::iota(members.begin(), members.end(), 0);
   grouped.resize(batch, count);
@@ -428,8 +480,8 @@ void MpcSearch::search(const MpcBatch& batch, double target, const MpcGuess& gue
     search_group(batch, target, guess, part, begin, to, runner, first, count);
     for (int64_t e : members) {
       const double now = grouped.objective[e], before = to.objective[e];
-      if (now < needed(before)) agreed[e] = found[e] = 0;
-      if (!(before < needed(now))) {
+      if (now < needed(e, before)) agreed[e] = found[e] = 0;
+      if (!(before < needed(e, now))) {
         agreed[e]++;
         found[e] += ended[e];
       }
@@ -488,7 +540,7 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
         const double* u = best[e] >= 0 ? tried.u.data() + best[e] * n.u : start > 0 ? earlier.u + e * n.u : nullptr;
         begin(batch, effort, start + begun + (j - before) / elements - shift, j, u);
       }
-      if (begun >= kFixed) tried.start[j].needed = needed(tried.objective[best[e]]);
+      if (begun >= kFixed) tried.start[j].needed = needed(e, tried.objective[best[e]]);
     }
     explore(batch, effort, runner, before, jobs, from_guess && whole);
     for (int64_t j = before; j < before + jobs; j++) {
@@ -502,7 +554,9 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
     begun = end;
     if (batch.relaxation > target && begun >= std::min(kFixed, starts)) runner.allot(kSearched);
     if (begun < half || runner.stopped()) continue;
-    const auto done = [&](int64_t e) { return settled(reached.data() + e * starts, begun); };
+    const auto done = [&](int64_t e) {
+      return settled(reached.data() + e * starts, begun, size(e, tried.objective[best[e]]));
+    };
     live.erase(std::remove_if(live.begin(), live.end(), done), live.end());
   }
 
@@ -510,7 +564,8 @@ void MpcSearch::search_group(const MpcBatch& batch, double target, const MpcGues
   patience.assign(count, brief ? 1 : kRounds);
   for (int64_t e : live) {
     const double* own = reached.data() + e * starts;
-    const bool lone = finders(own, starts, *std::min_element(own, own + starts)) == 1;
+    const double one = *std::min_element(own, own + starts);
+    const bool lone = finders(own, starts, one, size(e, one)) == 1;
     if (lone) patience[e] = std::max(patience[e], longer(batch, starts) / 2);
   }
   if (starts >= kFixed) improve(batch, effort, out, runner, first, count, false);
@@ -578,11 +633,11 @@ void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const int64_t e = tried.owner[j];
     const double there = tried.objective[j], least = out.objective[e];
     if (tried.status[j] == kUnreached || !(there < kHuge) || !solved(out.status[e])) continue;
-    ended[e] += finders(&there, 1, least) || !apart(batch, j, out.u + e * n.u);
+    ended[e] += finders(&there, 1, least, size(e, least)) || !apart(batch, j, out.u + e * n.u);
   }
   for (int64_t e : members) {
     // Out of time after its starts were compared: one that was solved by chance need not be the best.
-    const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < needed(out.objective[e]);
+    const bool behind = best[e] >= 0 && batch.n_c == 0 && tried.objective[best[e]] < needed(e, out.objective[e]);
     if (out.status[e] != kUnreached && !(runner.stopped() && behind)) continue;
     if (best[e] >= 0) {
       copy_plan(n, tried.plans(), best[e], out, e);
@@ -728,7 +783,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       tried.element[j] = batch.element_of(first + e);
       tried.start[j] = at_target(batch);
       tried.start[j].explore = kExploreFar;
-      tried.start[j].needed = needed(out.objective[e]);
+      tried.start[j].needed = needed(e, out.objective[e]);
       const int64_t v = j / elements;
       const int64_t kind = few && v == varied - 1 ? kSoftest : kVaried * round + v;
       const bool shifted = kind / kVaried % kRounds == 0 && idle[e] < kRounds;  // again, it would be in vain
@@ -742,7 +797,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
     dearer.assign(count, 0.0);
     for (int64_t j = 0; j < all && seeking && !batch.large(); j++) {
       const int64_t e = tried.owner[j];
-      const double more = std::max(tried.objective[j] - out.objective[e], 0.0) / std::abs(out.objective[e]);
+      const double more = std::max(tried.objective[j] - out.objective[e], 0.0) / size(e, out.objective[e]);
       dearer[e] += std::min(kDearest, more) / (kDearest * double(varied));
       patience[e] = std::max(patience[e], int64_t(std::ceil(dearer[e] * double(kSuspected))));
     }
@@ -754,7 +809,7 @@ void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
       const int64_t e = tried.owner[origin[i]];
       out.iterations[e] += finished.iterations[i];
       if (!solved(finished.status[i]) || !(finished.objective[i] < out.objective[e])) continue;
-      if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) {
+      if (finished.objective[i] < out.objective[e] - kGain * size(e, out.objective[e])) {
         idle[e] = -1;
         ended[e] = 0;  // no start found it
         if (!seeking && patience[e] > 1) patience[e] = std::max(kRounds, starts) + longer(batch, starts);

@@ -191,6 +191,18 @@ def test_contacts_are_sought_round_the_best_plan(build):
         assert bool((after < (1 - gain) * before).any())
 
 
+@pytest.mark.parametrize("effort", ["default", "best"])
+def test_the_origin_of_the_states_changes_no_search(build, effort):
+    """From 16 m away the costs are large numbers with small differences, which must not look alike."""
+    lcs, far, found = build.model(1, n_lam=4, scale=0.6).params().detach(), torch.full((4,), 16.0).double(), []
+    Q, R = torch.eye(4).double(), diagonal(0.01, 0.01)
+    for o in (0 * far, far):
+        moved = replace(lcs, d=lcs.d + o - lcs.A @ o, c=lcs.c - lcs.D @ o)
+        cost = QuadraticCost(Q, R, 10 * Q, q=-o, q_final=-10 * o, constant=9 * o @ o)
+        found.append(costs(LCSMPCLayer(moved, cost, 8, -1.0, 1.0), build.normal(1)(32, 4) + o, effort=effort))
+    assert ((found[1] / found[0] - 1).abs() < 1e-4).double().mean() > 0.9
+
+
 def test_a_plan_that_creeps_along_kinks_is_not_lost():
     """These 8 of 192 states have best plans that take over fifty steps at their relaxation."""
     which, known = [167, 129, 132, 89, 11, 191, 160, 58], [5.05, 6.08, 9.94, 6.13, 6.04, 14.54, 10.1, 5.78]
