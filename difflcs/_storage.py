@@ -8,12 +8,13 @@ import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from difflcs.errors import CheckpointError, InUseError, InvalidInputError, MissingDependencyError
 
@@ -26,6 +27,8 @@ MAX_TENSORS = 1 << 32
 _MAX_DEPTH = 32
 """Deepest nesting of JSON that is read; ours has six levels."""
 _FORMAT = 1
+
+M = TypeVar("M", bound=nn.Module)
 
 
 def check_path(name: str, path: Path) -> None:
@@ -284,6 +287,20 @@ def check_tensors(
             f"{actual.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
         )
     check_finite(source, got)
+
+
+def load_module(source: object, what: str, tensors: Mapping[str, Tensor], make: Callable[[], M]) -> M:
+    """Make a module and load it; sizes are compared before anything of these sizes is made, see `check_tensors`."""
+    try:
+        with torch.device("meta"):
+            wanted = {name: (tuple(value.shape), value.dtype) for name, value in make().state_dict().items()}
+    except RuntimeError as error:
+        raise CheckpointError(f"{source}: expected sizes that {what} can have, got others: {error}") from error
+    check_tensors(source, what, tensors, wanted)
+    with torch.random.fork_rng(devices=[]):  # for initial values, which are replaced
+        module = make()
+    module.load_state_dict(dict(tensors))
+    return module
 
 
 def check_finite(source: object, tensors: Mapping[str, Tensor]) -> None:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from difflcs._checks import check_number, check_positive_int
 from difflcs._optional import require
-from difflcs._storage import write_atomically
-from difflcs.errors import InvalidInputError
+from difflcs._storage import place_to_write, write_atomically
+from difflcs.errors import DTypeError, InvalidInputError
 
 _SAMPLES = 8  # frames that the common palette is made from: the first alone may lack colours of later ones
 _KINDS = {".gif": "GIF", ".png": "PNG"}
@@ -31,7 +32,8 @@ class Animation:
         dither: mix colours that the palette lacks from dots of others; makes larger files.
 
     Raises:
-        InvalidInputError: there is no frame, or frames differ in size.
+        DTypeError: a frame is no picture.
+        InvalidInputError: there is no frame, frames differ in size, or a number is out of its range.
         MissingDependencyError: Pillow is not installed.
     """
 
@@ -39,7 +41,13 @@ class Animation:
         require("PIL")
         from PIL import Image
 
-        pictures = [frame if isinstance(frame, Image.Image) else Image.fromarray(np.asarray(frame)) for frame in frames]
+        self.fps, colors = check_number("fps", fps, strict=True), check_positive_int("colors", colors, maximum=256)
+        try:
+            pictures = [one if isinstance(one, Image.Image) else Image.fromarray(np.asarray(one)) for one in frames]
+        except TypeError as error:
+            raise DTypeError(
+                f"frames: expected arrays (height, width, 3) of uint8, got others: {error}; convert them"
+            ) from error
         sizes = sorted({picture.size for picture in pictures})
         if len(sizes) != 1:
             raise InvalidInputError(
@@ -51,7 +59,6 @@ class Animation:
         palette = Image.fromarray(sample).quantize(colors, dither=Image.Dither.NONE)
         mode = Image.Dither.FLOYDSTEINBERG if dither else Image.Dither.NONE
         self._frames = [picture.quantize(palette=palette, dither=mode) for picture in pictures]
-        self.fps = fps
 
     @classmethod
     def draw(cls, figure: Any, draw: Callable[[int], object], frames: int, fps: float, **options: Any) -> Animation:
@@ -72,12 +79,14 @@ class Animation:
         """Write a GIF or an animated PNG, by the ending of the file's name.
 
         Raises:
-            InvalidInputError: the name ends in neither .gif nor .png.
+            InvalidInputError: the name ends in neither .gif nor .png, or the file cannot be written.
         """
         path = Path(path)
-        if path.suffix not in _KINDS:
+        kind = _KINDS.get(path.suffix.lower())
+        if kind is None:
             raise InvalidInputError(f"path: expected a name that ends in .gif or .png, got {str(path)!r}; rename it")
-        write_atomically(path, self._encode(_KINDS[path.suffix]))
+        with place_to_write(path, "path"):
+            write_atomically(path, self._encode(kind))
 
     def _encode(self, kind: str) -> bytes:
         buffer = BytesIO()

@@ -278,7 +278,8 @@ class LCSModel(PredictiveModule):
         _storage.check_tensors(source, "a model", tensors, {name: (shape, dtype) for name, shape in shapes.items()})
         support = tensors.get("action_support")
         try:
-            model = cls(n_x, n_u, n_lam, stiffness, learn_c=learn_c, dtype=dtype, action_support=support)
+            with torch.random.fork_rng(devices=[]):  # for initial values, which are replaced
+                model = cls(n_x, n_u, n_lam, stiffness, learn_c=learn_c, dtype=dtype, action_support=support)
             model.load_state_dict(dict(tensors))
         except BoundsError as error:
             raise CheckpointError(f"{source}: its action support cannot be used: {error}") from error

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import describe, to_tensor
+from difflcs._checks import check_positive_int, describe, to_tensor
 from difflcs.constraints import StageBounds
 from difflcs.errors import DegenerateWarning, DTypeError, InvalidInputError, NonFiniteError, SolveWarning
 
@@ -191,12 +191,16 @@ def collect(
         | ("errors", name) | (N,) | what remains after the last step, of each entry of the info that ends in `_error` |
 
     Raises:
-        InvalidInputError: too many seeds, an episode of another length, observations that autoreset overwrites, a
-            context that changes during an episode, a reward that is not finite, or a success that is no bool.
-        DTypeError: actions of another size than the action space.
+        InvalidInputError: too many seeds, or negative ones, an episode of another length, observations that autoreset
+            overwrites, a context that changes during an episode, a reward that is not finite, or a success that is no
+            bool.
+        DTypeError: actions of another size than the action space, or a policy in place of `mpc_actions(policy)`.
     """
     from tensordict import TensorDict  # takes a second
 
+    if isinstance(act, torch.nn.Module) or not callable(act):
+        raise DTypeError(f"act: expected a function of state and goal, got {type(act).__name__}; use mpc_actions(act)")
+    seeds = [check_positive_int("seeds", seed, minimum=0) for seed in seeds]
     n = len(seeds)
     _check_env(env, n)
     low, high = (bound.numpy() for bound in action_bounds(env, policy))
@@ -271,7 +275,7 @@ def _success(value: object) -> bool:
 
 
 def _check_env(env: VectorEnv, episodes: int) -> None:
-    if not 1 <= episodes <= env.num_envs:
+    if not 1 <= episodes <= check_env(env).num_envs:
         raise InvalidInputError(f"seeds: expected 1 to num_envs={env.num_envs} of them, got {episodes}")
     mode = getattr(env.metadata.get("autoreset_mode"), "value", None)
     if mode != "NextStep":  # SameStep hides the last observation, Disabled cannot step beyond a broken episode

@@ -26,9 +26,8 @@ PREFIX = "zoo:"
 MODELS = Path(__file__).parent / "models"
 """Folder of the models, each in a folder with config.json, model.safetensors and card.json."""
 
-_NUMBERS = ("minutes", "success_rate", "ci_low", "ci_high")
-_COUNTS = ("seed", "goals", "evaluation_seed", "solver_failures")
-_WORDS = ("name", "task", "method", "backend", "version", "command")
+_MOST = {"minutes": 1e6, "success_rate": 1, "ci_low": 1, "ci_high": 1}
+"""Largest values of the numbers of a card; of the others what 63 bits hold."""
 
 
 @dataclass(frozen=True)
@@ -174,16 +173,14 @@ def _read(file: Path) -> ModelCard:
     if not isinstance(values, dict) or set(values) != wanted:
         got = sorted(values) if isinstance(values, dict) else type(values).__name__
         raise CheckpointError(f"{file}: expected fields {sorted(wanted)}, got {_storage.short(got)}; {remedy}")
-    kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
-    kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
-    for name, kind in kinds.items():
-        if not isinstance(values[name], kind) or isinstance(values[name], bool):
-            got = _storage.short(values[name])
-            raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {got}; {remedy}")
-    ranges = dict.fromkeys(("success_rate", "ci_low", "ci_high"), (0, 1)) | dict.fromkeys(_COUNTS, (0, 2**63))
-    for name, (low, high) in {**ranges, "minutes": (0, 1e6)}.items():
-        if not low <= values[name] <= high:
-            raise CheckpointError(f"{file}: expected {low} to {high:g} for {name}, got {values[name]}; {remedy}")
+    for f in fields(ModelCard):
+        value, kind = values[f.name], {str: str, int: int, float: int | float}.get(f.type, dict)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            wanted, got = getattr(kind, "__name__", kind), _storage.short(value)
+            raise CheckpointError(f"{file}: expected {wanted} for {f.name}, got {got}; {remedy}")
+        most = _MOST.get(f.name, 2**63)
+        if isinstance(value, int | float) and not 0 <= value <= most:
+            raise CheckpointError(f"{file}: expected 0 to {most:g} for {f.name}, got {value}; {remedy}")
     check_object(values["object"], file)
     if not all(isinstance(version, str | None) for version in values["versions"].values()):
         raise CheckpointError(f"{file}: expected texts as versions, got {_storage.short(values['versions'])}; {remedy}")

@@ -294,7 +294,9 @@ def test_what_was_learned_of_other_sizes_is_refused(name, finished):
 def test_an_evaluation_repeats_bit_for_bit(name, finished):
     envs = TOY.make_envs(3)
     results = [evaluate(envs, load_policy(finished(name), TOY), 7, 5, STEPS) for _ in range(2)]
+    before = torch.random.get_rng_state()
     policy = load_policy(finished(name).path, TOY)
+    assert torch.equal(torch.random.get_rng_state(), before)
     results += [evaluate(envs, policy, 7, 5, STEPS) for _ in range(2)]
     assert all(result == results[0] for result in results)
     assert results[0].goals == 7

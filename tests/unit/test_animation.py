@@ -28,13 +28,23 @@ def test_a_drawn_figure_is_saved_by_its_ending_and_closed(tmp_path):
     film = Animation.draw(figure, lambda i: axes.plot([0, i]), 4, fps=5)
     assert not pyplot.fignum_exists(figure.number)
     assert repr(film) == "Animation(4 frames, 5 a second)"
-    for kind in ("gif", "png"):
+    for kind in ("gif", "PNG"):
         film.save(tmp_path / f"film.{kind}")
         with Image.open(tmp_path / f"film.{kind}") as picture:
-            assert (picture.format.lower(), picture.n_frames) == (kind, 4)
+            assert (picture.format, picture.n_frames) == (kind.upper(), 4)
     refuse(InvalidInputError, r"ends in \.gif or \.png", film.save, tmp_path / "film.mp4")
+    refuse(InvalidInputError, "expected a place to write", film.save, tmp_path / "film.gif" / "film.gif")
 
 
-@pytest.mark.parametrize("frames", [[], [FRAMES[0], FRAMES[0][:4]]], ids=["none", "two sizes"])
-def test_frames_that_are_no_film_are_refused(frames):
-    refuse(InvalidInputError, "of one size", Animation, frames, fps=10)
+@pytest.mark.parametrize(
+    ("frames", "options", "message"),
+    [
+        ([], {}, "of one size"),
+        ([FRAMES[0], FRAMES[0][:4]], {}, "of one size"),
+        ([FRAMES[0] / 255], {}, "frames: expected arrays .* of uint8"),
+        (FRAMES, {"fps": 0}, "fps: expected a finite number above 0"),
+        (FRAMES, {"colors": 257}, "colors: expected at most 256"),
+    ],
+)
+def test_what_is_no_film_is_refused(frames, options, message):
+    refuse(InvalidInputError, message, Animation, frames, **{"fps": 10, **options})

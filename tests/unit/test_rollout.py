@@ -58,6 +58,9 @@ def test_same_step_autoreset_is_refused():
     env = SyncVectorEnv([PusherEnv], autoreset_mode=AutoresetMode.SAME_STEP)
     refuse(InvalidInputError, "autoreset", collect, env, mpc_actions(Reach()), [1], STEPS)
     refuse(InvalidInputError, "num_envs=1", collect, make_envs(1), mpc_actions(Reach()), [1, 2], STEPS)
+    refuse(InvalidInputError, "seeds: expected at least 0", collect, make_envs(1), mpc_actions(Reach()), [-1], STEPS)
+    refuse(InvalidInputError, "env: expected a VectorEnv", collect, None, mpc_actions(Reach()), [1], STEPS)
+    refuse(DTypeError, "act: expected a function .* Identity; use", collect, env, torch.nn.Identity(), [1], STEPS)
 
 
 def test_records_are_extended_by_stable_episodes_and_keep_the_newest():

@@ -211,16 +211,4 @@ class Ensemble(nn.Module):
             n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in _SIZES)
         except (KeyError, InvalidInputError) as error:
             raise CheckpointError(f"{source}: expected an ensemble written by difflcs, got {error}") from error
-        sizes = [n_x + n_u, width, width, n_x]
-        shapes: dict[str, tuple[int, ...]] = {}
-        for i, (n_in, n_out) in enumerate(pairwise(sizes)):
-            shapes |= {f"weights.{i}": (networks, n_in, n_out), f"biases.{i}": (networks, 1, n_out)}
-        for name, size in (("input", n_x + n_u), ("change", n_x)):
-            shapes |= {f"{name}_mean": (size,), f"{name}_std": (size,)}
-        # Compared before anything of these sizes is made.
-        _storage.check_tensors(
-            source, "an ensemble", tensors, {name: (shape, torch.float32) for name, shape in shapes.items()}
-        )
-        ensemble = cls(n_x, n_u, networks, width)
-        ensemble.load_state_dict(dict(tensors))
-        return ensemble
+        return _storage.load_module(source, "an ensemble", tensors, lambda: cls(n_x, n_u, networks, width))

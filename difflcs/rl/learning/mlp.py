@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import pairwise
+from functools import partial
 from typing import Any
 
 import torch
@@ -115,16 +115,8 @@ class MLPController(nn.Module):
         """
         try:
             n_features, width, episode_steps = (check_positive_int(name, config[name]) for name in _SIZES)
-            n_u = tensors["u_min"].numel()
+            zero = torch.zeros(tensors["u_min"].numel())  # in place of the bounds, which are loaded
         except (KeyError, InvalidInputError) as error:
             raise CheckpointError(f"{source}: expected a network written by difflcs, got {error}") from error
-        # Compared before anything of these sizes is made.
-        shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
-        for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
-            shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
-        _storage.check_tensors(
-            source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()}
-        )
-        network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)
-        network.load_state_dict(dict(tensors))
-        return network
+        make = partial(cls, features, n_features, zero, zero, width, episode_steps)
+        return _storage.load_module(source, "a network", tensors, make)
