@@ -22,10 +22,12 @@ def test_a_step_of_a_random_scene_is_like_mujocos_or_says_why_not(first):
 # two places, and discrete steps, which do without `refsafe`; friction that holds where drives are about in balance; a
 # limit of a joint's force that hides an unstable drive; unstable steps of what falls at rest, or that grow beyond all
 # bounds; a limit that holds a stiff drive far from where it would swing; a solver that does not converge.
+# Of the last three one is an unstable tendon, which implicit steps let go too far; few actions of the others are wrong.
 @pytest.mark.parametrize("seed", [
     204727, 221696, 212620, 206886, 211247, 217759, 211973, 224956, 600553, 721086, 722012, 748582, 756693, 771837,
     207920, 700659, 883972, 906895, 910251, 901169, 983651, 1150282, 1151680, 1188118, 906806,
-    981230, 1088492, 1118528, 1178111, 1192015, 987829, 1403827, 3007981, 1540462, 1419746])  # fmt: skip
+    981230, 1088492, 1118528, 1178111, 1192015, 987829, 1403827, 3007981, 1540462, 1419746,
+    1734673, 1736684, 1827432])  # fmt: skip
 def test_a_scene_that_was_once_silent_is_not(seed):
     judged = scenes.judge(seed)
     assert judged

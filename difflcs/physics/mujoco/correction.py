@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_shape, check_tensor
-from difflcs.errors import ContactWarning, InvalidInputError, warn
+from difflcs.errors import InvalidInputError
 from difflcs.lcp import solve_lcp
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import Rows
@@ -31,20 +31,12 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
-_NEAR = 1e-9  # [m, rad] to a state from which a step is as good as the same
 _FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
-_FARTHER = 0.4  # of the speed before and of what forces do, by which an error is more than that of standing still
 _JAMS = 30.0  # times what there is to move: forces of contacts that press against each other
-_MOST = 1e99  # a velocity whose square is a number
-_STILL = 1e-3  # [m/s, rad/s], a speed that is none
-_CREEP = 0.01  # [m/s, rad/s], a speed at which rounding moves what touches in many points
-_NEVER = 1e4  # times what moves: motion without constraints that grows beyond all bounds is no measure of errors
+STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 _SLIGHT = 0.2  # of all motion, up to which Δ of contacts counts wholly, if no robot presses them; up to twice: in part
-_HARDLY = 0.8  # of the motion in MuJoCo, if it is more than `_FARTHER`: what misses so much of it holds still
-_NEARLY = 0.005  # of the median change with all actions: an error that is none
 _APART = 0.5  # [rad, m] in a step, by which joints go farther without constraints
-_JUMPS = 0.1  # of the velocity of a tree, by which MuJoCo's own step hangs on rounding
 _HELD = 10.0  # times the speed before and the change in MuJoCo: all motion, where contacts hold against larger forces
 
 
@@ -57,7 +49,7 @@ class WholeStep:
     """
 
     def __init__(self, motion: Dynamic, limits: bool):
-        self.model, self._motion = motion.model, motion
+        self.model, self.motion = motion.model, motion
         self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
 
     def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
@@ -69,30 +61,13 @@ class WholeStep:
             ctrl: (n, nu) controls.
         """
         try:
-            return self._motion.run(self._native, places, states, ctrl)
+            return self.motion.run(self._native, places, states, ctrl)
         except InvalidInputError:  # the systems stand without a correction
             return np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
 
-    def warn_of_jumps(self, places: Places, states: Array, ctrl: Array, before: Array, inverse_mass: Array) -> None:
-        """Warn where states next to these lead to other velocities, see `simulate`; `before` are those now (n, nv)."""
-        nv, near = self.model.nv, np.tile(states, (4, 1, 1))
-        near[1:, :, : self.model.nq] += _NEAR * np.random.default_rng(0).normal(size=(3, len(states), self.model.nq))
-        after = self.simulate(places, near.reshape(-1, states.shape[1]), np.tile(ctrl, (4, 1)))
-        after = after.reshape(4, len(states), -1)[..., nv : 2 * nv]
-        mass, in_tree = np.linalg.inv(inverse_mass), self._motion.in_tree
-        jumps, moves = (_size(v, mass, in_tree) for v in (after - after[0], np.stack([before, after[0]])))
-        creep = _CREEP * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree)
-        if (apart := (jumps > _JUMPS * moves.max(0) + creep).any((0, 2))).any():
-            warn(
-                f"expected steps of MuJoCo that say what a system is like, got some that a change of {_NEAR} m and rad "
-                f"leads far away in {apart.sum()} of {len(apart)} states: let its solver converge, with more "
-                f"iterations (opt.iterations) or softer constraints (solref, solimp), or take smaller time steps",
-                ContactWarning,
-            )
-
     def hold(self, read: Linearised, places: Places, states: Array, x: Array) -> Array:
         """Simulate at the nominal controls; linearise half way there what goes much farther without constraints."""
-        motion, nv = self._motion, self.model.nv
+        motion, nv = self.motion, self.model.nv
         ctrl = read.nominal + x[:, :nv] @ motion.moment.T
         after = self.simulate(places, states, ctrl)
         after[read.unstable & (np.abs(after).max(1) > FAST_MOTION)] = np.nan  # unstable steps may lead anywhere
@@ -129,18 +104,11 @@ class WholeStep:
         return torch.stack(found, -2)
 
 
-def predict(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-    """Compute next states (..., n_x) and forces (..., n_lam) of systems, like `difflcs.records.advance`.
+def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] | None = None) -> Array:
+    """Find forces (..., n_lam) of systems at states and actions by the active sets.
 
     The first forces of each are likely those that `acts` (..., k) says.
     """
-    lam = find_forces(system, x, u, acts)
-    A, B, C, d = (v.numpy() for v in (system.A, system.B, system.C, system.d))
-    return _times(A, x) + _times(B, u) + _times(C, lam) + d, lam
-
-
-def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] | None = None) -> Array:
-    """Find these forces (..., n_lam) by the active sets."""
     D, E, F, c = (v.numpy() for v in (system.D, system.E, system.F, system.c))
     gap = _times(D, x) + _times(E, u) + c
     m = gap.shape[-1]
@@ -152,11 +120,6 @@ def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] |
     if (more := np.flatnonzero(~found)).size:
         lam[more] = solve_lcp(torch.from_numpy(F[more % len(F)]), torch.from_numpy(q[more])).lam.numpy()
     return lam.reshape(gap.shape)
-
-
-def _size(moved: Array, mass: Any, in_tree: NDArray[np.bool_]) -> Array:
-    """Size (..., n, n_trees) of velocities (..., n, nv), by the energy of each tree of bodies."""
-    return np.sqrt(np.maximum(moved * _times(mass, moved) @ in_tree, 0.0))
 
 
 def _times(matrix: Array, vector: Array) -> Array:
@@ -180,8 +143,9 @@ def correct(
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
     at = [v.reshape(*batch, v.shape[1]) for v in (x, step.idle)]
-    found = predict(system, at[0], at[1], acts)
-    known = system.C.numpy(), system.d.numpy(), *found
+    found = find_forces(system, at[0], at[1], acts)
+    A, B, C, d = (v.numpy() for v in (system.A, system.B, system.C, system.d))
+    known = C, d, _times(A, at[0]) + _times(B, at[1]) + _times(C, found) + d, found
     C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]) for v in known)
     C, of_servos = C[:, :, : acts.shape[-1]], C[:, :, acts.shape[-1] :]
     lam = lam[:, : C.shape[2]]
@@ -213,7 +177,7 @@ def correct(
     pressed = np.maximum(1.0, np.sqrt(total) / np.maximum(_JAMS * (before + alone), 1e-300))
     counts = 1 - share / pressed * (1 - np.clip(np.maximum(worse, slight), 0.0, 1.0))
     least = np.maximum(_FAR * (moves + alone), _SMALL * (moves + alone).sum(1, keepdims=True))
-    doubtful = (off > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)
+    doubtful = (off > np.maximum(moves, least) + STILL * np.sqrt(mass.sum(1))).any(1)
     # A difference that grew with a force that actions change by far would be many times as large with some. Dry
     # friction far below its bound is whatever holds, so it does not grow with this either.
     of_rows = slice(n_contacts, n_contacts + n_limits + n_bounded)
@@ -232,40 +196,3 @@ def correct(
     C = np.concatenate([C, of_servos], -1)
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
     return LCSParams.of_checked({"C": C, "d": d}, like=system), doubtful
-
-
-def warn_of_wrong(
-    predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, motion: Dynamic
-) -> None:
-    """Warn where velocities are farther from MuJoCo's than those before the step, or hardly change, with some actions.
-
-    Each tree of bodies counts by itself, as an object may be much lighter than the robot.
-
-    They are (m, n, nv) of m actions at n states, MuJoCo's `after`, `before` (n, nv) and `free` (k, m, n, nv) in k ways
-    without constraints, of which the slowest counts, where they are finite; inverse_mass is (n, nv, nv).
-    """
-    mass, model, in_tree = np.linalg.inv(inverse_mass), motion.model, motion.in_tree
-    predicted = np.where(np.abs(predicted) < _MOST, predicted, _MOST)  # where there is no number as well
-    off, least = predicted - after, _STILL * np.sqrt(np.diagonal(mass, axis1=1, axis2=2) @ in_tree)
-    error, change, alone, speed = (_size(v, mass, in_tree) for v in (off, after - before, free - before, before))
-    alone = np.nan_to_num(alone)
-    alone = np.where(alone < _NEVER * (speed + np.nan_to_num(change) + least), alone, 0.0).min(0)
-    moves = speed + alone
-    least = least + _NEARLY * np.nan_to_num(np.median(change, 0))  # near balance any error of large actions shows
-    most = change + _FARTHER * moves + least
-    held = (change > _FARTHER * moves + least) & (error > _HARDLY * change)
-    excess = (error - np.where(held, 0.0, most)) / most
-    wrong = np.any(excess > 0, (0, 2))
-    if wrong.any():
-        *worst, tree = np.unravel_index(np.nanargmax(excess), most.shape)
-        moved = off[tuple(worst)]
-        dof = int(np.argmax(np.abs(moved * (mass[worst[1]] @ moved)) * in_tree[:, tree]))
-        joint, body = model.joint(model.dof_jntid[dof]), model.body(model.dof_bodyid[dof])
-        warn(
-            f"expected a system as near to MuJoCo's own step as standing still is, that moves where MuJoCo does, also "
-            f"at the ends of the ranges of its actions and between, got one that is farther off, or holds still, with "
-            f"such an action in {wrong.sum()} of {len(wrong)} states, most of all joint {joint.name or joint.id!r} of "
-            f"body {body.name or body.id!r}: take fewer seconds, less friction, a nominal control near the actions, "
-            f"or a ctrlrange of the actuators without such actions",
-            ContactWarning,
-        )

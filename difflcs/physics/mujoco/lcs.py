@@ -18,12 +18,12 @@ from difflcs.physics.complementarity import Cone, Contacts, count_forces, given_
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
-from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces, predict, warn_of_wrong
+from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import Groups, find_budgets
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
-from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
+from difflcs.physics.mujoco.motion import Dynamic
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
 from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
@@ -32,11 +32,9 @@ from difflcs.physics.mujoco.quasi_static import QuasiStatic
 from difflcs.physics.mujoco.readings import Readings
 from difflcs.physics.mujoco.servos import Servos
 from difflcs.physics.mujoco.state import MujocoState
+from difflcs.physics.mujoco.tries import Tries
 from difflcs.records import LCSParams, LCSSequence, sequence_along
 
-_TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
-_BETWEEN = 16  # of these actions that are neither ends of ranges nor zero
-_TOUCHES = 0.03  # of the change of velocity: what constraints do where they do something
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 
 
@@ -159,8 +157,7 @@ class MujocoLCS:
         self.length, self._recovery = length, Recovery(model, length)
         budgets = find_budgets(model, contacts, distance)
         plain = motion == "dynamic" and pairs is None and friction is None and torsion
-        self._whole, self._asked = WholeStep(self._motion, limits != 0) if plain else None, 0
-        self._parts = torch.from_numpy(np.random.default_rng(0).random((_BETWEEN, 1, model.nu)))
+        self._whole = WholeStep(self._motion, limits != 0) if plain else None
         pushed = motion != "dynamic" and model.nu < model.nv and model.ngeom > 1
         more = distance, length, budgets, friction, torsion, pushed
         self._finder = ContactFinder(model, self._data, self._places, pairs, *more, motion == "dynamic")
@@ -171,6 +168,7 @@ class MujocoLCS:
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
             self._give, self._yields = _respond(self, limits != 0)
+        self._tries = self._whole and Tries(self._whole, self._places, relative, self._yields)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is built again, as what is compiled holds addresses."""
@@ -261,7 +259,8 @@ class MujocoLCS:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
             more = rows.bound / unit, found, hard, read.batched(rest != 0)
             system, read.doubtful[:] = correct(system, step, read.after, *more)
-        _try_actions(self, system, read, step)
+        if step is not None and self._tries is not None:
+            self._tries.warn(system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
@@ -357,78 +356,6 @@ def _rest_on_forces(of: MujocoLCS, system: LCSParams, read: Readings, response: 
         firm += more
         c[..., :count] -= more * lam[..., :count]
         of._caps.limit_by_forces(c, lam, read, response)
-
-
-def _try_actions(of: MujocoLCS, system: LCSParams, read: Readings, step: DynamicStep | None) -> None:
-    """Warn where systems are far off with no control, at the ends of the ranges of actions, between, or in balance."""
-    before, of._asked = of._asked, of._asked + len(read.x)
-    due = of._actuators.curved.size > 0 or before.bit_length() < of._asked.bit_length()
-    some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
-    if step is None or (whole := of._whole) is None or not some.size:
-        return
-    nv, x, bounds = of.state.nv, torch.from_numpy(read.x[some]), of.action_bounds(torch.from_numpy(read.x[some]))
-    flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-    ways = (True, False) if of._motion.loosens else (True,)
-
-    def compare(u: Tensor) -> list[Any]:
-        """Velocities (k, m, n, nv) after actions (m, n, nu): of systems, in MuJoCo, in k ways without constraints."""
-        m, each = len(u), x.expand(len(u), *x.shape)
-        ctrl = of.control(each, u).reshape(m * len(some), of.n_u).numpy()
-        states, unstable = np.tile(read.states[some], (m, 1)), np.tile(read.moved.unstable[some], m)
-        after = whole.simulate(of._places, states, ctrl)
-        free = np.stack([of._motion.simulate(of._places, states, ctrl, unstable, loose=way) for way in ways])
-        predicted, _ = predict(LCSParams.of_checked(flat), each.numpy(), u.numpy())
-        return [v.reshape(-1, m, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free)]
-
-    u, low, high = _choose_actions(of, x, torch.from_numpy(step.idle[some]), bounds)
-    _, to, alone = tried = compare(u)
-    balanced = u + _find_balance(step, some, to[0], alone[0], (high - low).numpy())
-    more = compare(torch.minimum(torch.maximum(balanced, low), high).clamp(*bounds).flatten(0, 1))
-    at, to, alone = (np.concatenate(both, 1) for both in zip(tried, more, strict=True))
-    more = step.velocity[some], read.moved.inverse_mass[some]
-    warn_of_wrong(at[0], to[0], alone, *more, step.motion)
-    ctrl = of.control(x, torch.from_numpy(step.idle[some])).numpy()
-    whole.warn_of_jumps(of._places, read.states[some], ctrl, *more)
-
-
-def _choose_actions(of: MujocoLCS, x: Tensor, idle: Tensor, bounds: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose actions (m, n, nu) within their bounds at states (n, n_x) with nominal ones; and ends of their ranges."""
-    zero, usual = of.control(x, torch.zeros_like(idle)), torch.from_numpy(of._actuators.usual)
-    ends = torch.from_numpy(of._actuators.range)[:, None] - zero
-    likely = torch.stack([torch.minimum(idle, -zero) - usual, torch.maximum(idle, -zero) + usual])
-    low, high = ends = torch.where(ends.isfinite(), ends, likely)
-    parts = of._parts.clone()
-    parts[::2, :, of._actuators.curved] **= 3  # muscles and dampers bend most where they do nothing
-    turns = torch.where(torch.arange(of.n_u) % 2 > 0, ends, ends.flip(0))
-    u = torch.cat([ends, turns, low + parts * (high - low), torch.stack([idle, -zero])]).clamp(*bounds)
-    return u, low, high
-
-
-def _find_balance(step: DynamicStep, some: Any, after: Any, free: Any, size: Any) -> Tensor:
-    """Compute by how much actions miss balance, in which a tree of bodies that is in touch goes on as it is.
-
-    Near balance little decides what friction and contacts do. What drives alone do says where it is, for one tree of
-    bodies after the other, by the least change of actions in parts of their `size` (n, nu).
-
-    Args:
-        step: the step, of which `some` n states are meant.
-        some: their numbers.
-        after: (m, n, nv) velocities after m actions.
-        free: (m, n, nv) those without constraints. Where these change nothing, so does the balance.
-        size: see above.
-
-    Returns:
-        (2, m, n, nu) with all forces, and without those of constraints.
-    """
-    nv, n_x, before, in_tree = step.place.shape[1], step.x.shape[1], step.velocity[some], step.motion.in_tree
-    by_action, after, free = step.step[some, nv : 2 * nv, n_x:-1], np.nan_to_num(after), np.nan_to_num(free)
-    trees = in_tree.T[in_tree.T @ by_action.any((0, 2))]
-    trees = np.resize(trees, (len(after), 1, nv))
-    touches = np.abs(after - free).max(0) > _TOUCHES * np.abs(after - before).max(0)
-    weights = trees * (touches @ in_tree @ in_tree.T) * np.diagonal(step.inverse_mass[some], axis1=1, axis2=2) ** -0.5
-    change = weights * (np.stack([after, free]) - before)
-    back = np.linalg.pinv(weights[..., None] * by_action * size[:, None], 1e-6) @ change[..., None]
-    return torch.from_numpy(-size * back[..., 0])
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

@@ -268,7 +268,8 @@ class LearnableMujocoLCS(nn.Module):
         compliance = self._options["compliance"] * factors.get("compliance", 1.0)
         built = MujocoLCS(model, self._data, **{**self._options, "compliance": compliance})
         built.state = self.state
-        built._asked = 1 << 62  # what actions do was tried with the first module
+        if built._tries is not None:
+            built._tries.asked = 1 << 62  # what actions do was tried with the first module
         built._servos.those = kept[1]._servos.those
         if keep:
             self._built = key, built
