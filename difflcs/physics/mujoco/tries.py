@@ -20,7 +20,7 @@ from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
 _TRIED = 8  # states at which actions are tried, of the first, and each time that a module was asked for twice as many
-_ALL_OVER = 64  # actions all over the ranges
+_ALL_OVER, _LEAST = 128, 32  # actions all over the ranges of one state, or of all together; of each at least
 _BEYOND = 1.2  # of the ranges, in which actions are chosen, so that some are at ends
 _BALANCED = 8  # actions from which balance is sought
 _NEAR = 1e-9  # [m, rad] to a state from which a step is as good as the same
@@ -61,7 +61,8 @@ class Tries:
             return
         trial = _Trial(self, system, read, step, some)
         size = trial.high - trial.low
-        u = np.concatenate([trial.low + self._parts * size, trial.ends, [trial.idle, -trial.zero]])
+        parts = self._parts[: max(_LEAST, _ALL_OVER // len(some))]
+        u = np.concatenate([trial.low + parts * size, trial.ends, [trial.idle, -trial.zero]])
         trial.run(_balance(u, *trial.run(u), step, some, size))
         trial.warn_of_wrong()
         trial.warn_of_jumps()
