@@ -55,13 +55,14 @@ class Tries:
     def warn(self, system: LCSParams, read: Readings, step: DynamicStep) -> None:
         """Warn where the system is far off with an action that is tried, or MuJoCo's step hangs on rounding."""
         before, self.asked = self.asked, self.asked + len(read.x)
-        due = step.motion.actuators.curved.size > 0 or before.bit_length() < self.asked.bit_length()
+        more = before.bit_length() < self.asked.bit_length()
+        due = more or step.motion.actuators.curved.size > 0
         some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
         if not some.size:
             return
         trial = _Trial(self, system, read, step, some)
         size = trial.high - trial.low
-        parts = self._parts[: max(_LEAST, _ALL_OVER // len(some))]
+        parts = self._parts[: max(_LEAST, _ALL_OVER * more // len(some))]
         u = np.concatenate([trial.low + parts * size, trial.ends, [trial.idle, -trial.zero]])
         trial.run(_balance(u, *trial.run(u), step, some, size))
         trial.warn_of_wrong()
