@@ -77,7 +77,7 @@ class Reader {
 
   // Write M⁻¹.
   void read_mass(const double* state, double* inverse_mass) const {
-    set(state);
+    begin(state);
     library_.fwd_position(motion_.simulated, place_.data);
     library_.solve_mass(motion_.simulated, place_.data, inverse_mass, motion_.identity.data(), motion_.nv);
   }
@@ -91,14 +91,19 @@ class Reader {
 
   // Write ζ, ν and the change of activation after the steps from a state at a control.
   void advance(const double* state, const double* ctrl, double* after) const {
-    set(state);
+    begin(state);
     std::copy_n(ctrl, motion_.nu, place_.ctrl);
-    std::fill_n(place_.qacc_warmstart, motion_.nv, 0.0);
     simulate(motion_.steps);
     change(state, after);
   }
 
  private:
+  // Set a state, and forget the accelerations of other motions, which may be infinite.
+  void begin(const double* state) const {
+    set(state);
+    std::fill_n(place_.qacc_warmstart, motion_.nv, 0.0);
+  }
+
   void set(const double* state) const {
     std::copy_n(state, motion_.nq, place_.qpos);
     std::copy_n(state + motion_.nq, motion_.nv, place_.qvel);
