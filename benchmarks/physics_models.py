@@ -9,7 +9,7 @@ contact, or where a joint or tendon is at its limit in this step. Beside them ar
 steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included. Both are also told with a
 nominal control near the action, nine tenths of the way, as that of a plan's next pass is.
 
-With `--times` only the CPU time of a state in one batch is told, of each motion and of MuJoCo's own steps, in turn.
+With `--times` only CPU and wall time of a state in one batch are told, of each motion and MuJoCo's own steps, in turn.
 Judo's LEAP hands and arm are there too; in place of their meshes, which its wheel lacks, are hulls of 32 points.
 """
 
@@ -76,6 +76,8 @@ class Options:
     """Seed of motions and controls."""
     times: bool = False
     """Times alone; their JSON lies beside that of the errors."""
+    threads: int = 1
+    """Threads of a batch."""
     out: Path = Path("benchmarks/results/physics_models.json")
     """Where the JSON goes."""
 
@@ -231,7 +233,7 @@ def measure(model: Any, o: Options, asked: dict[str, Any] | None = None) -> dict
 
 
 def clock(model: Any, o: Options) -> dict[str, Any] | None:
-    """Median CPU times of a state [µs], in one batch of all, by motion; "mujoco": its own steps one by one."""
+    """Median CPU and wall times of a state [µs], in one batch of all, by motion; "mujoco": its own steps one by one."""
     states, data, steps = roam(model, o.states, np.random.default_rng(o.seed)), mujoco.MjData(model), count_steps(model)
 
     def simulate() -> None:
@@ -243,18 +245,19 @@ def clock(model: Any, o: Options) -> dict[str, Any] | None:
         with suppress(DiffLCSError):
             module = MujocoLCS(model, motion=motion, seconds=steps * model.opt.timestep)
             ways[motion] = partial(module.params, torch.stack([module.state.to_state(*state) for state in states]))
-    times: dict[str, list[float]] = {name: [] for name in ways}
+    times: dict[str, list[list[float]]] = {name: [] for name in ways}
     for _ in range(10):  # the first does not count
         for name, way in ways.items():
-            start = time.process_time()
+            cpu, wall = time.process_time(), time.perf_counter()
             way()
-            times[name].append(1e6 * (time.process_time() - start) / len(states))
-    return {name: float(np.median(each[1:])) for name, each in times.items()} if len(ways) > 1 else None
+            times[name].append([time.process_time() - cpu, time.perf_counter() - wall])
+    medians = {name: (1e6 * np.median(each[1:], 0) / len(states)).tolist() for name, each in times.items()}
+    return medians if len(ways) > 1 else None
 
 
 def main(o: Options) -> None:
     """Measure, print, write."""
-    torch.set_num_threads(1)
+    torch.set_num_threads(o.threads)
     if o.times:
         o.out = o.out.with_stem(f"{o.out.stem}-times")
     results: dict[str, dict[str, Any]] = {}
@@ -281,7 +284,7 @@ def main(o: Options) -> None:
             row |= {"warnings": sorted({str(w.message) for w in said})}
             results[name] = row
             print(name, row.get("refused") or (row if o.times else describe(row)), flush=True)
-    options = {"states": o.states, "seed": o.seed, "seconds": SECONDS}
+    options = {"states": o.states, "seed": o.seed, "seconds": SECONDS, "threads": o.threads}
     save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})
 
 

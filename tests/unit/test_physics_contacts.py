@@ -11,9 +11,9 @@ import torch
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco import Distance, MujocoCost, MujocoLCS
+from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import ScaledRows
-from difflcs.physics.mujoco.nominal import solve_forces
 from difflcs.physics.mujoco.readings import Readings
 from tests.conftest import refuse
 
@@ -128,7 +128,9 @@ def test_soft_forces_are_clipped_by_their_bounds(m, nv):
     response, high = factor @ factor.swapaxes(-1, -2), random.uniform(0, 3, (50, m))
     for low, most in ((0 * high, np.full_like(high, np.inf)), (-high, high)):
         F = rows @ response @ rows.swapaxes(-1, -2) + 1e-3 * np.eye(m)
-        force, found = solve_forces(F, gap, low, most, np.zeros_like(gap), 1e-3)
+        force, found = np.zeros_like(gap), np.zeros(len(gap), dtype=bool)
+        system = {"D": gap[:, :0], "E": gap[:, :0], "F": F, "c": gap}
+        _mujoco.solve_forces(1e-3, 1, system, gap[:, :0], gap[:, :0], low, most, force, found)
         assert found.all()
         slack = gap + np.einsum("nmi,nij,nkj,nk->nm", rows, response, rows, force)
         np.testing.assert_allclose(force, np.clip(-slack / 1e-3, low, most), rtol=0, atol=1e-7 * np.abs(force).max())

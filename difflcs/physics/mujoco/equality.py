@@ -31,26 +31,13 @@ class EqualityRows(NamedTuple):
         gap: (n, k) r.
         normal: (n, k, nv) its derivative E by the degrees of freedom.
         damping: (n, k) b [1/s].
-        force: (n, nv, k) Eᵀ/R.
+        firm: (n, k) R.
     """
 
     gap: Array
     normal: Array
     damping: Array
-    force: Array
-
-    def push(self, stiff: Array, factor: Array) -> Array:
-        """Return the part of K (n, nv, nv) that drives the constraints apart; M⁻¹ is L Lᵀ of the `factor` L.
-
-        An impedance that grows with the violation takes a larger part of a load there, though less of it is left: as
-        far as the derivative sees, the constraint pushes on.
-        """
-        along = self.normal @ factor
-        within = np.linalg.pinv(along, _DEPENDENT) @ along
-        held = within @ np.linalg.solve(factor, stiff @ factor) @ within
-        size, directions = np.linalg.eigh(0.5 * (held + held.swapaxes(-1, -2)))
-        grows = directions * np.maximum(size, 0.0)[:, None] @ directions.swapaxes(-1, -2)
-        return factor @ grows @ np.linalg.inv(factor)
+    firm: Array
 
 
 class Equality:
@@ -91,8 +78,7 @@ class Equality:
                 mujoco.mj_solveM(model, data, gives, jacobian)
                 firm = np.maximum(data.efc_R, _FIRMEST * (gives * jacobian).sum(-1))
                 rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, 1], firm)])
-        gap, normal, damping, regularisation = map(np.stack, zip(*rows, strict=True))
-        return EqualityRows(gap, normal, damping, normal.swapaxes(-1, -2) / regularisation[:, None])
+        return EqualityRows(*map(np.stack, zip(*rows, strict=True)))
 
     def hold_positions(self, free: FreeMotion, x: Array, qpos: Array, tangent: Array | None) -> FreeMotion:
         """Return a motion of positions x (n, nv), which are qpos (n, nq), that keeps to the constraints."""

@@ -257,7 +257,7 @@ class MujocoLCS:
         system = self._servos.limit(system, free, step, read, self.length, self._give)
         if step is not None and overlaps is not None and read.after is not None:
             hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = rows.bound / unit, found, hard, read.batched(rest != 0)
+            more = rows.bound / unit, found, hard, rest != 0
             system, read.doubtful[:] = correct(system, step, read.after, *more)
         if step is not None and self._tries is not None:
             self._tries.warn(system, read, step)
@@ -318,7 +318,7 @@ class MujocoLCS:
     def _read(self, x: Tensor, context: Tensor | None = None) -> Readings:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
-        flat = to_numpy(x).reshape(n, self.n_x)
+        flat = np.ascontiguousarray(to_numpy(x).reshape(n, self.n_x))
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._caps.order(self._finder.find(qpos))
         tangent = self.state.tangent(flat[:, : self.state.nv])

@@ -106,7 +106,7 @@ class Places:
 
     def take(self, n: int) -> list[_mujoco.Place]:
         """Return places for n states, with all that is not in the state as in the first."""
-        first, threads = self._all[0], max(1, min(n, torch.get_num_threads()))
+        first, threads = self._all[0], count_threads(n)
         while len(self._all) < threads:
             model = copy.copy(first.model)
             self._all.append(Place(model, mujoco.MjData(model)))
@@ -129,6 +129,11 @@ class Places:
                     getattr(first.data.warning, name)[:] = getattr(place.data.warning, name)
                 if said:
                     raise mujoco.FatalError(said)
+
+
+def count_threads(n: int) -> int:
+    """Count the threads for n states."""
+    return max(1, min(n, torch.get_num_threads()))
 
 
 def _address(name: str, field: np.ndarray, kind: type = np.float64) -> int:

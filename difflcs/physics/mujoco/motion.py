@@ -27,15 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs._checks import check_positive_int
+from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
-from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import factor_inverse, flags, implicit_response, least_time
+from difflcs.physics.mujoco.library import Places, addresses, count_threads, library
+from difflcs.physics.mujoco.native import flags, least_time
 
 Array = NDArray[np.float64]
 
-_BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
 FAST_MOTION = 100.0  # a motion in a step [m, rad] or velocity that may be that of unstable steps
 _FINER = 4  # how many steps for one of MuJoCo's where these are unstable
 _LONGEST = 100_000  # time steps in one step of the system, far more than any plan is for
@@ -47,6 +47,7 @@ _EULER, _RK4, _IMPLICIT, _FAST, _DISCRETE = (  # the last in MuJoCo 3.14 and lat
 _HINGE, _FAR = int(mujoco.mjtJoint.mjJNT_HINGE), 0.5  # turn of it in a step [rad], in which what drives do changes
 _DIFFERENCE = 1e-6, 1e-4  # in parts of the size of actions; with equality constraints, which are solved less exactly
 _GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
+_WAYS = {_EULER: 0, _RK4: 2, _DISCRETE: 3}  # of `Way` in _native/step.hpp; 1: others
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit", _DISCRETE: "mj_Euler"}
 
 
@@ -73,7 +74,14 @@ class Dynamic:
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
         self._disabled, self._described = int(model.opt.disableflags), {}
-        self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
+        # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
+        g = _GROWS ** (1 / self.simulated.count)
+        most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
+        fields: dict[str, Any] = {"nv": model.nv, "na": model.na, "nu": model.nu, "seconds": seconds, "most": most}
+        fields |= {"damping": (model.dof_damping * damped).tolist(), "brakes": actuators.brakes.tolist()}
+        kinds = self.steps, self.simulated, self.finer
+        steps = [(k, _WAYS.get(way, 1), actuators.durations(seconds / k).tolist()) for k, way in kinds]
+        self._dynamics = _mujoco.Dynamics(fields | {"steps": steps})
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
         self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
         self.in_tree = self.tree[:, None] == self.trees  # (nv, n_trees)
@@ -100,8 +108,7 @@ class Dynamic:
             InvalidInputError: MuJoCo raised an error, or has counted a warning.
         """
         read = self.read_by(self._native(self.simulated), places, states, ctrl)
-        unstable = self.find_unstable(read)
-        if unstable.any():
+        if (unstable := read.unstable.copy()).any():
             again = self.read_by(self._native(self.finer), places, states[unstable], ctrl[unstable])
             for values, better in zip(read, again, strict=True):
                 values[unstable] = better
@@ -168,36 +175,13 @@ class Dynamic:
         n, nv, nu = len(states), self.model.nv, self.model.nu
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x - nv, n_x + nu), (nv, nv), (nu,), (n_x,))
-        arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
-        places.check(_mujoco.read_motion(library(), described, places.take(n), states, ctrl, *arrays), n)
+        arrays = (np.zeros((n, *size)) for size in sizes)
         read = Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
+        taken = self._dynamics, places.take(n), states, np.ascontiguousarray(ctrl), read._asdict()
+        places.check(_mujoco.read_motion(library(), described, *taken), n)
         activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
         self.actuators.even_out(read.nominal, activation, read.rates)
         return read
-
-    def find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
-        """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
-        nv, h = self.model.nv, self.seconds / self.simulated.count
-        if self.simulated.integrator == _DISCRETE:
-            return np.zeros(len(read.rates), dtype=bool)
-        inverse_mass, brakes = read.inverse_mass, self.actuators.brakes
-        both = [(read.rates[:, :nv, :nv], read.rates[:, :nv, nv : 2 * nv])]
-        if brakes.any():  # drives at a limit of their force, which overshoot without growing, have no derivative
-            both += [(np.zeros_like(inverse_mass), -inverse_mass * brakes)]
-        # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
-        g = _GROWS ** (1 / self.simulated.count)
-        most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
-        unstable = np.zeros(len(read.rates), dtype=bool)
-        for stiff, damped in both:
-            rates = h * damped + 0.5 * h * h * stiff
-            implicit = -damped if self.simulated.integrator != _EULER else inverse_mass * self.damping
-            if self.simulated.integrator != _RK4 and implicit.any():
-                rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
-            found = np.einsum("nij,nji->n", rates, rates) > most**2  # the sum of squares of the eigenvalues
-            if found.any():
-                found[found] = np.linalg.eigvals(rates[found]).real.min(-1) < -most
-                unstable |= found
-        return unstable
 
     def describe(self, steps: Steps, disabled: int) -> _mujoco.Motion:
         """Describe for the compiled part how the motion is simulated and linearised, and what balances actuators.
@@ -229,102 +213,24 @@ class Dynamic:
         return model
 
     def finish(self, read: Linearised, x: Array, tangent: Array | None, equality: Any = None) -> DynamicStep:
-        """Return the motion at states x (n, n_x), for the tangent of their rotations, with soft `EqualityRows`."""
-        nv, h, n_x = self.model.nv, self.seconds, x.shape[1]
-        velocity, forces = x[:, nv : 2 * nv], np.concatenate([read.rates, read.acceleration[:, :, None]], -1)
-        inverse_mass, factor = read.inverse_mass, factor_inverse(read.inverse_mass)
-        back: Any = np.linalg.inv(factor)
-        mass = back.swapaxes(-1, -2) @ back
-        heavier, drag = mass, np.zeros_like(mass)
-        if equality is not None:  # the rates have them
-            more = equality.force @ equality.normal
-            heavier, stiff = mass + more, np.eye(nv) + factor.swapaxes(-1, -2) @ more @ factor
-            held_by = np.linalg.cholesky(0.5 * (stiff + stiff.swapaxes(-1, -2)))
-            factor = np.linalg.solve(held_by, factor.swapaxes(-1, -2)).swapaxes(-1, -2)
-            inverse_mass = factor @ factor.swapaxes(-1, -2)
-            drag = equality.force @ (equality.damping[:, :, None] * equality.normal)
-            back = np.linalg.inv(factor)
-            forces[:, :nv, :nv] -= equality.push(forces[:, :nv, :nv], factor)
-        # With ν = 0, ζ = 0 and u = ū.
-        forces[:, :, -1:] -= forces[:, :, :n_x] @ read.middle[:, :, None]
-        slow = -heavier @ forces[:, :nv, nv : 2 * nv] - drag
-        damping = np.diag(self.damping) if self.steps.integrator == _EULER else slow
-        response = implicit_response(factor, back, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
-        # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
-        held = heavier if self.steps.integrator == _DISCRETE else mass
-        bodies = factor, back
-        step = self._steps(held, forces, damping, self.steps, *bodies)
-        implicit = self._implicit(response @ heavier, forces)
-        if (some := read.unstable).any():
-            step[some] = self._steps(mass[some], forces[some], slow[some], self.finer, *bodies)
-        far = ~(np.abs(step).max((1, 2)) < _BEYOND)
-        step[far] = implicit[far]
-        # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        simulated = step
-        if self.simulated != self.steps:
-            simulated = self._steps(mass, forces, damping, self.simulated, *bodies)
-            simulated[some] = step[some]
-        curved = np.arange(read.secant.shape[2]) + n_x
-        more = (read.reached - _reached(simulated, velocity))[:, :, None]
-        more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
-        more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
-        linear = step[:, :, curved]
-        step[:, :, [*curved, -1]] += more
-        if curved.size:
-            kept = (linear * step[:, :, curved]).sum(1) / np.maximum((linear * linear).sum(1), 1e-300)
-            implicit[:, :, curved] *= np.clip(kept, 0.0, 1.0)[:, None]
-        place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
-        turn = None if tangent is None else _find_turn(tangent)
-        return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal, turn)
+        """Return the motion at states x (n, n_x), for the tangent of their rotations, with soft `EqualityRows`.
 
-    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps, factor: Array, back: Array) -> Array:
-        """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
-
-        The `damping` (nv, nv) or (n, nv, nv) is implicit; the `factor` is that of M⁻¹, of the mass, `back` its inverse.
+        Raises:
+            InvalidInputError: rounding leaves no factor of a mass matrix.
         """
-        n, of, nv = len(forces), forces.shape[2], self.model.nv
-        n_x = nv + forces.shape[1]
-        h, one = self.seconds / steps.count, np.zeros((n, of, of))
-        activation = self.actuators.durations(h)[:, None] * forces[:, nv:]
-        if steps.integrator == _RK4:
-            one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces[:, :nv]
-            one[:, 2 * nv : n_x], grown = activation, np.eye(of)
-            for k in (4, 3, 2, 1):
-                grown = np.eye(of) + one @ grown / k
-            one = grown
-        else:
-            rates, one[:] = forces[:, :nv].copy(), np.eye(of)
-            if steps.integrator == _DISCRETE:  # at the position after the step
-                rates[:, :, nv : 2 * nv] += h * rates[:, :, :nv]
-                response = implicit_response(factor, back, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
-                turns = h * h * mass @ forces[:, :nv, :nv]  # of stiff forces that turn with the bodies, a part is skew
-                response = np.linalg.solve(np.eye(nv) + 0.5 * response @ (turns.swapaxes(-1, -2) - turns), response)
-                one[:, nv : 2 * nv] += h * response @ mass @ rates
-            else:
-                if damping.any():
-                    rates = np.linalg.solve(mass + h * damping, mass) @ rates
-                one[:, nv : 2 * nv] += h * rates
-            one[:, :nv] += h * one[:, nv : 2 * nv]
-            one[:, 2 * nv : n_x] += activation
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.matrix_power(one, steps.count)[:, :n_x]
-
-    def _implicit(self, resists: Array, forces: Array) -> Array:
-        """Compute the same by one implicit step, which keeps (n, nv, nv) `resists` = S M of the change in velocity."""
-        nv, na, h = self.model.nv, self.model.na, self.seconds
-        one, activation = h * forces[:, :nv], h * forces[:, nv:]
-        if na:  # which follows the action in this step, and drives in the mean of it
-            decay = h * -np.diagonal(forces[:, nv:, 2 * nv : 2 * nv + na], axis1=1, axis2=2)
-            decay = np.where(np.abs(decay) < 1e-4, 1e-4, decay)
-            after = -np.expm1(-decay) / decay
-            one += one[:, :, 2 * nv : 2 * nv + na] @ (((1 - after) / decay)[:, :, None] * activation)
-            activation *= after[:, :, None]
-        one[:, :, nv : 2 * nv] = np.eye(nv)
-        velocity = resists @ one
-        place = h * velocity
-        place[:, :, :nv] += np.eye(nv)
-        activation[:, :, 2 * nv : 2 * nv + na] += np.eye(na)
-        return np.concatenate([place, velocity, activation], 1)
+        (n, n_x), nv, nu = x.shape, self.model.nv, self.model.nu
+        given = read._asdict() | {"x": x, "normal": np.zeros((n, 0, nv)), "damping": x[:, :0], "firm": x[:, :0]}
+        given |= equality._asdict() if equality is not None else {}
+        sizes = {"step": (n_x, n_x + nu + 1), "delayed": (2 * nv, n_x + nu + 1), "response": (nv, nv)}
+        sizes |= {"inverse_mass": (nv, nv), "place": (nv,)}
+        found = {name: np.empty((n, *size)) for name, size in sizes.items()}
+        if not _mujoco.make_steps(count_threads(n), self._dynamics, given, found):
+            raise InvalidInputError(
+                "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
+                "make the lightest bodies heavier, or add armature to their joints"
+            )
+        turn = None if tangent is None else _find_turn(tangent)
+        return DynamicStep(self, x, **found, idle=read.nominal, turn=turn)
 
 
 class Steps(NamedTuple):
@@ -439,9 +345,3 @@ def _find_turn(tangent: Array) -> tuple[Any, Any, Any]:
     those = np.flatnonzero(differs.any(0) | differs.any(1))
     block = tangent[:, those[:, None], those]
     return those, block, np.linalg.inv(block)
-
-
-def _reached(step: Array, velocity: Array) -> Array:
-    """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""
-    nv = velocity.shape[1]
-    return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]

@@ -129,30 +129,3 @@ def native(model: Any, data: Any, where: str) -> Iterator[None]:
     mujoco.mj_resetData(model, data)  # what an error leaves behind, such as a stack that was not given back
     copy_taken(data, kept)
     raise InvalidInputError(f"{text.format(**size)} ({where})") from said
-
-
-def factor_inverse(inverse_mass: Array) -> Array:
-    """Return L (n, nv, nv) of M⁻¹ = L Lᵀ.
-
-    Raises:
-        InvalidInputError: rounding leaves no such factor.
-    """
-    try:
-        return np.linalg.cholesky(inverse_mass).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:
-        raise InvalidInputError(
-            "model: expected a mass matrix that double precision can factor, got one that is singular by rounding; "
-            "make the lightest bodies heavier, or add armature to their joints"
-        ) from None
-
-
-def implicit_response(factor: Array, back: Array, K: Array, D: Array, h: float) -> Array:
-    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly.
-
-    The `factor` (n, nv, nv) is L of M⁻¹ = L Lᵀ, `back` its inverse, as M itself has lost the lightest bodies to
-    rounding where some are 10¹⁰ times as heavy.
-    """
-    scaled = back @ (-h * (D + h * K)) @ factor
-    size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
-    directions = factor @ directions
-    return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs.errors import ContactWarning, warn
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
+from difflcs.physics.mujoco.library import count_threads
 from difflcs.physics.mujoco.limits import Rows, ScaledRows
 from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.native import least_time
@@ -116,23 +116,6 @@ class Situation(NamedTuple):
     opens: bool
 
 
-def solve_forces(
-    F: Array, q: Array, low: Array, high: Array, start: Array, compliance: float = 0.0
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Find λ (n, m) between bounds where q + F λ (n, m) is zero within them, and else presses λ against them.
-
-    So 0 ≤ λ ⊥ q + F λ ≥ 0 between 0 and infinity; between −b and b it is dry friction. Return λ, and a mask (n,) of
-    those that were found. The matrices F (k, m, m) are taken in turn. With a compliance, which F has on its diagonal,
-    it is symmetric. Within their bounds are probably those that are so in `start`.
-    """
-    lam, found = np.array(start, dtype=np.float64, order="C"), np.zeros(len(q), dtype=bool)
-    if q.size:
-        threads = max(1, min(len(q), torch.get_num_threads()))
-        F, q, low, high = (np.ascontiguousarray(values) for values in (F, q, low, high))
-        _mujoco.solve_forces(compliance, threads, F, q, low, high, lam, found)
-    return lam, found | (not q.size)
-
-
 def evaluate_nominal(at: Situation) -> Nominal:
     """Decide which contacts close, hold or slide at the nominal action, and which rows act.
 
@@ -155,7 +138,7 @@ def evaluate_nominal(at: Situation) -> Nominal:
     sizes = {"gap": (r,), "normal": (r, nv), "impulse": (r, nv), "bound": (rows.n_friction,), "unit": (r,)}
     sizes |= {"soft": (k,), "opened": (k,), "turned": (k, t, nv), "forces": (k, max(1, 2 * t)), "row_forces": (r,)}
     found = {name: np.zeros((n, *size)) for name, size in sizes.items()} | {"carried": np.zeros_like(step.delayed)}
-    if missed := _mujoco.evaluate_nominal(max(1, min(n, torch.get_num_threads())), given, found):
+    if missed := _mujoco.evaluate_nominal(count_threads(n), given, found):
         warn(
             f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} "
             f"of {n} states, so that what touches there may creep: look for bodies of very different mass, "

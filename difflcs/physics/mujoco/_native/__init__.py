@@ -3,7 +3,7 @@
 try:
     from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 
-    _mujoco.evaluate_nominal  # noqa: B018  the newest
+    _mujoco.make_steps  # noqa: B018  the newest
 except (ImportError, AttributeError):
     raise ImportError(
         "difflcs: expected the compiled part of difflcs.physics.mujoco of this version, got none or an older one; "

@@ -15,6 +15,9 @@ class Place:
 class Motion:
     def __init__(self, fields: Mapping[str, Any]) -> None: ...
 
+class Dynamics:
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
+
 def find_contacts(
     library: Library,
     scene: Scene,
@@ -31,15 +34,11 @@ def find_contacts(
 def read_motion(
     library: Library,
     motion: Motion,
+    dynamics: Dynamics,
     places: Sequence[Place],
     state: np.ndarray,
     ctrl: np.ndarray,
-    middle: np.ndarray,
-    acceleration: np.ndarray,
-    rates: np.ndarray,
-    inverse_mass: np.ndarray,
-    nominal: np.ndarray,
-    reached: np.ndarray,
+    found: Mapping[str, np.ndarray],
 ) -> tuple[int, int, str]: ...
 def read_rest(
     library: Library,
@@ -66,10 +65,11 @@ def simulate(
     after: np.ndarray,
 ) -> tuple[int, int, str]: ...
 def solve_forces(
-    c: float,
+    compliance: float,
     threads: int,
-    F: np.ndarray,
-    q: np.ndarray,
+    system: Mapping[str, np.ndarray],
+    x: np.ndarray,
+    u: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     lam: np.ndarray,
@@ -84,3 +84,5 @@ def assemble(
     found: Mapping[str, np.ndarray],
 ) -> bool: ...
 def evaluate_nominal(threads: int, given: Mapping[str, Any], found: Mapping[str, np.ndarray]) -> int: ...
+def make_steps(threads: int, dynamics: Dynamics, given: Mapping[str, Any], found: Mapping[str, np.ndarray]) -> bool: ...
+def correct(threads: int, still: float, fields: Mapping[str, Any], doubtful: np.ndarray) -> None: ...

@@ -2,7 +2,7 @@
 // degrees of freedom, so its rows are mostly zeros, which are left out of each product.
 #pragma once
 
-#include "forces.hpp"
+#include "matrices.hpp"
 
 namespace difflcs::physics {
 
@@ -28,17 +28,6 @@ struct Given {
 struct Matrices {
   double *C, *d, *D, *E, *F, *c;
 };
-
-// Whether a matrix (n, n) plus a multiple of one has positive eigenvalues only. It is overwritten.
-inline bool is_positive(double* M, int n, double shift) {
-  for (int c = 0; c < n; c++) {
-    const double pivot = M[c * n + c] + shift;
-    if (!(pivot > 0)) return false;
-    for (int i = c + 1; i < n; i++)
-      if (M[c * n + i] != 0) add(-M[c * n + i] / pivot, M + c * n + i, n - i, M + i * n + i);
-  }
-  return true;
-}
 
 // Writes the matrices of a state, zero before; false where only their numbers say whether they are finite, F + Fᵀ ≻ 0.
 DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
@@ -111,17 +100,20 @@ DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const
   }
   // What is rows R rowsᵀ with a positive R is no less than zero (an `effect` is another in the velocities alone), and the
   // compliance is more than rounding.
+  Matrix R;
   double trace = 0;
+  R.resize(nv, nv);
   for (int v = 0; v < nv; v++) trace += g.response[v * nx + v];
   for (int v = 0; v < nv; v++)
-    for (int w = 0; w < nv; w++) transposed[v * nv + w] = 0.5 * (g.response[v * nx + w] + g.response[w * nx + v]);
+    for (int w = 0; w < nv; w++) R[v][w] = 0.5 * (g.response[v * nx + w] + g.response[w * nx + v]);
+  R.add_identity(kRounding * trace);
   const double off = kRounding * (trace * size * s.force + m * largest);
   double squares = 0;
   for (const auto& [numbers, count] :
        {std::pair<const double*, int>{g.A, nx * nx}, {g.B, nx * s.nu}, {into.C, nx * all}, {into.d, nx},
         {into.D, all * nx}, {into.E, all * s.nu}, {into.F, all * all}, {into.c, all}})
     squares += dot(numbers, numbers, count);
-  return std::isfinite(squares) && softest > 2 * off && is_positive(transposed.data(), nv, kRounding * trace);
+  return std::isfinite(squares) && softest > 2 * off && factor(R);
 }
 
 }  // namespace difflcs::physics

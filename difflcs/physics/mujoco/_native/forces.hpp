@@ -17,11 +17,16 @@
 
 namespace difflcs::physics {
 
-constexpr double kDependent = 1e-9;  // of the trace: contacts of one face are not independent
+constexpr double kTiny = 1e-300;     // beside a divisor that may be zero
 constexpr double kLeft = 0.1;        // of the derivative along a direction, that may be left where it ends
 constexpr double kSlight = 1e-13;    // of the terms of a sum: rounding
 constexpr int kMostSets = 200;       // of active sets; about five are needed
 constexpr int kPatience = 4;         // sets that need not be better than the best so far
+
+template <class T>
+bool is_zero(const T* row, int n) {
+  return std::all_of(row, row + n, [](T x) { return x == 0; });
+}
 
 inline double dot(const double* a, const double* b, int n) {
   double sums[8] = {}, sum = 0;  // side by side
@@ -38,10 +43,19 @@ inline void add(double factor, const double* row, int n, double* __restrict into
   for (int k = 0; k < n; k++) into[k] += factor * row[k];
 }
 
+// into (m) += four numbers times four rows (4, m).
+inline void add_four(const double* by, const double* rows, int m, double* __restrict into) {
+  const double a = by[0], b = by[1], c = by[2], d = by[3];
+  for (int k = 0; k < m; k++) into[k] += a * rows[k] + b * rows[m + k] + c * rows[2 * m + k] + d * rows[3 * m + k];
+}
+
 // into (m) = row (n) times a matrix (n, m). A row of contacts is mostly zeros.
 inline void multiply(const double* row, const double* matrix, int n, int m, double* into) {
   std::fill_n(into, m, 0.0);
-  for (int v = 0; v < n; v++)
+  int v = 0;
+  for (; v + 4 <= n; v += 4)
+    if (!is_zero(row + v, 4)) add_four(row + v, matrix + v * m, m, into);
+  for (; v < n; v++)
     if (row[v] != 0) add(row[v], matrix + v * m, m, into);
 }
 
@@ -68,32 +82,6 @@ inline bool solve_dense(double* M, int n, double* b, int m) {
     for (int k = 0; k < m; k++) b[i * m + k] /= M[i * n + i];
   }
   return true;
-}
-
-// Writes the motion (nv, m) by which rows (k, nv) move by (k, m), with the response R to forces along others (k, nv).
-// Rows of zeros have none.
-DIFFLCS_CLONES static void push_of(const double* R, const double* rows, const double* forces, const double* by, int k,
-                                   int nv, int m, double* moved) {
-  std::vector<const double*> along;
-  std::vector<double> gives, ways;
-  for (int i = 0; i < k; i++) {
-    const double* row = rows + i * nv;
-    if (std::all_of(row, row + nv, [](double x) { return x == 0; })) continue;
-    along.push_back(row);
-    ways.insert(ways.end(), by + i * m, by + i * m + m);
-    for (int v = 0; v < nv; v++) gives.push_back(dot(R + v * nv, forces + i * nv, nv));
-  }
-  const int some = static_cast<int>(along.size());
-  std::vector<double> inner(some * some);
-  double trace = 0;
-  for (int i = 0; i < some; i++)
-    for (int j = 0; j < some; j++) inner[i * some + j] = dot(along[i], &gives[j * nv], nv);
-  for (int i = 0; i < some; i++) trace += inner[i * some + i];
-  for (int i = 0; i < some; i++) inner[i * some + i] += trace > 0 ? kDependent * trace : 1.0;
-  std::fill_n(moved, nv * m, 0.0);
-  if (!solve_dense(inner.data(), some, ways.data(), m)) return;
-  for (int i = 0; i < some; i++)
-    for (int v = 0; v < nv; v++) add(gives[i * nv + v], &ways[i * m], m, moved + v * m);
 }
 
 // Finds λ between bounds with w = q + F λ, for a P-matrix F (n, n): w is zero where λ is within them, and at a bound of

@@ -13,10 +13,12 @@
 #include <thread>
 
 #include "assembly.hpp"
+#include "correction.hpp"
 #include "finder.hpp"
 #include "forces.hpp"
 #include "motion.hpp"
 #include "nominal.hpp"
+#include "step.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -36,6 +38,12 @@ T at(const nb::dict& fields, const char* name) {
 template <class T>
 T value(const nb::dict& fields, const char* name) {
   return nb::cast<T>(fields[name]);
+}
+
+// Numbers as they are: a copy would not outlive the call.
+template <class T>
+Array<T> array(const nb::dict& fields, const char* name) {
+  return nb::cast<Array<T>>(fields[name], false);
 }
 
 Library make_library(const nb::dict& f, int kinds, int stride) {
@@ -69,8 +77,8 @@ Scene make_scene(const nb::dict& f) {
   const auto axis = value<std::vector<double>>(f, "axis");
   s.planar = !axis.empty();
   if (s.planar) s.axis = load(axis.data());
-  const auto box = value<Array<const double>>(f, "box");
-  const auto moves = value<Array<const bool>>(f, "moves");
+  const auto box = array<const double>(f, "box");
+  const auto moves = array<const bool>(f, "moves");
   for (const auto& [radius, kind, root, solid] : value<std::vector<std::tuple<double, int, int, int>>>(f, "geoms")) {
     const size_t g = s.geoms.size();
     const double* around = box.data() + 6 * g;
@@ -142,6 +150,15 @@ Motion make_motion(const nb::dict& f) {
   return m;
 }
 
+Dynamics make_dynamics(const nb::dict& f) {
+  std::vector<TimeSteps> steps;
+  for (const auto& [count, way, durations] : value<std::vector<std::tuple<int, int, std::vector<double>>>>(f, "steps"))
+    steps.push_back({count, way, durations});
+  return {value<int>(f, "nv"), value<int>(f, "na"), value<int>(f, "nu"), value<double>(f, "seconds"),
+          value<double>(f, "most"), value<std::vector<double>>(f, "damping"), value<std::vector<double>>(f, "brakes"),
+          steps.at(0), steps.at(1), steps.at(2)};
+}
+
 // Where MuJoCo said an error or warned: the first state, or −1, the place that it was at, and the error.
 using Outcome = std::tuple<int64_t, int64_t, std::string>;
 
@@ -184,6 +201,29 @@ void check(bool fits) {
   if (!fits) throw std::invalid_argument("expected arrays of the sizes of the model, a row for each state");
 }
 
+// Of fields by their names the sizes, for each state.
+template <class T, class Row>
+using Fields = std::initializer_list<std::tuple<const char*, T* Row::*, int>>;
+
+// Sizes of the dimensions of arrays by their names.
+auto size_in(const nb::dict& f) {
+  return [&f](const char* name, int axis) {
+    return static_cast<int>(value<nb::ndarray<nb::device::cpu>>(f, name).shape(axis));
+  };
+}
+
+// Points n rows at their numbers in arrays of each state or of all; what is empty is left out.
+template <class T, class Row>
+void bind(const nb::dict& f, Fields<T, Row> fields, std::vector<Row>& rows) {
+  const size_t n = rows.size();
+  for (const auto& [name, field, size] : fields) {
+    const auto numbers = array<T>(f, name);
+    const size_t step = numbers.size() == n * size ? size : 0;
+    check(step > 0 || numbers.size() == static_cast<size_t>(size) || numbers.size() == 0);
+    for (size_t i = 0; i < n && numbers.size() > 0; i++) rows[i].*field = numbers.data() + i * step;
+  }
+}
+
 // Finds the contacts of states qpos (n, nq).
 Outcome find_contacts(const Library& library, const Scene& scene, const std::vector<const Place*>& places,
                       Array<const double> qpos, Array<const double> within, Array<double> gap, Array<double> normal,
@@ -201,24 +241,27 @@ Outcome find_contacts(const Library& library, const Scene& scene, const std::vec
   });
 }
 
-// Reads the motion at states (n, nq + nv + na) with nominal controls ctrl (n, nu).
-Outcome read_motion(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
-                    Array<const double> state, Array<const double> ctrl, Array<double> middle,
-                    Array<double> acceleration, Array<double> rates, Array<double> inverse_mass,
-                    Array<double> nominal, Array<double> reached) {
-  const size_t n = state.shape(0), nv = motion.nv, na = motion.na, nu = motion.nu, size = motion.size();
-  check(state.size() == n * (motion.nq + nv + na) && ctrl.size() == n * nu && middle.size() == n * size &&
-        acceleration.size() == n * (nv + na) && rates.size() == n * (nv + na) * (size + nu) &&
-        inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
-        !places.empty());
+// Reads the motion at states (n, nq + nv + na) with nominal controls ctrl (n, nu), and where it is unstable.
+Outcome read_motion(const Library& library, const Motion& motion, const Dynamics& dynamics,
+                    const std::vector<const Place*>& places, Array<const double> state, Array<const double> ctrl,
+                    const nb::dict& found) {
+  const size_t n = state.shape(0);
+  const int nv = motion.nv, na = motion.na, nu = motion.nu, size = motion.size();
+  check(state.size() == n * (motion.nq + nv + na) && ctrl.size() == n * nu && nv == dynamics.nv && !places.empty());
+  std::vector<Linearised> into(n);
+  bind<double, Linearised>(
+      found, {{"middle", &Linearised::middle, size}, {"acceleration", &Linearised::acceleration, nv + na},
+              {"rates", &Linearised::rates, (nv + na) * (size + nu)}, {"inverse_mass", &Linearised::inverse_mass, nv * nv},
+              {"nominal", &Linearised::nominal, nu}, {"reached", &Linearised::reached, size}},
+      into);
+  bind<bool, Linearised>(found, {{"unstable", &Linearised::unstable, 1}}, into);
   const size_t each = size + motion.nq + 3 * nv + na + nu;
   std::vector<double> memory(places.size() * each);
+  std::vector<StepMaker> makers(places.size(), StepMaker(dynamics));
   return at_places(library, places, n, [&](size_t p, int64_t i) {
-    const Linearised into{middle.data() + i * size,          acceleration.data() + i * (nv + na),
-                          rates.data() + i * (nv + na) * (size + nu), inverse_mass.data() + i * nv * nv,
-                          nominal.data() + i * nu,           reached.data() + i * size};
     Reader(library, motion, *places[p])
-        .read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into, &memory[p * each]);
+        .read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into[i], &memory[p * each]);
+    *into[i].unstable = makers[p].overshoots(into[i].rates, into[i].inverse_mass);
   });
 }
 
@@ -276,42 +319,59 @@ Outcome simulate(const Library& library, const Motion& motion, const std::vector
   });
 }
 
-// Forces λ (n, m) between bounds for q (n, m) and F (k, m, m), taken in turn; `found` (n) says which. F is symmetric with
-// a compliance c on its diagonal, or c is zero.
-void solve_forces(double c, int threads, Array<const double> F, Array<const double> q, Array<const double> low,
-                  Array<const double> high, Array<double> lam, Array<bool> found) {
-  const size_t n = q.shape(0), m = q.shape(1), k = F.shape(0);
-  check(F.size() == k * m * m && (k > 0 || n == 0) && lam.size() == n * m && found.size() == n && threads > 0 &&
-        low.size() == n * m && high.size() == n * m);
+// Forces lam (n, m) between bounds, from where they are, of systems taken in turn, at states x (n, n_x) and actions u. F is
+// symmetric with a compliance on its diagonal, or that is zero. Of those that are not `found` (n) lam is the free gap.
+void solve_forces(double compliance, int threads, const nb::dict& f, Array<const double> x, Array<const double> u,
+                  Array<const double> low, Array<const double> high, Array<double> lam, Array<bool> found) {
+  const auto D = array<const double>(f, "D"), E = array<const double>(f, "E"),
+             F = array<const double>(f, "F"), c = array<const double>(f, "c");
+  const size_t n = found.size(), m = lam.shape(1), nx = x.shape(1), nu = u.shape(1);
+  check(lam.size() == n * m && x.size() == n * nx && u.size() == n * nu && D.size() % std::max<size_t>(m * nx, 1) == 0 &&
+        E.size() % std::max<size_t>(m * nu, 1) == 0 && F.size() % (m * m) == 0 && c.size() % m == 0 &&
+        low.size() % m == 0 && high.size() == low.size());
+  const auto row = [](const auto& of, size_t i, size_t size) { return of.data() + (size > 0 ? i * size % of.size() : 0); };
   std::vector<ActiveSet> solvers(threads);
   on_threads(threads, n, [&](size_t thread, int64_t i) {
-    found.data()[i] = solvers[thread].solve(F.data() + i % k * m * m, q.data() + i * m, low.data() + i * m,
-                                            high.data() + i * m, c, static_cast<int>(m), lam.data() + i * m);
+    double* forces = lam.data() + i * m;
+    std::vector<double> gap(row(c, i, m), row(c, i, m) + m);
+    for (size_t j = 0; j < m; j++)
+      gap[j] += dot(row(D, i, m * nx) + j * nx, row(x, i, nx), nx) + dot(row(E, i, m * nu) + j * nu, row(u, i, nu), nu);
+    found.data()[i] = solvers[thread].solve(row(F, i, m * m), gap.data(), row(low, i, m), row(high, i, m), compliance, m,
+                                            forces);
+    if (!found.data()[i]) std::copy(gap.begin(), gap.end(), forces);
     return true;
   });
 }
 
-// Of fields by their names the sizes, for each state.
-template <class T, class Row>
-using Fields = std::initializer_list<std::tuple<const char*, T* Row::*, int>>;
-
-// Points n rows at their numbers in arrays of each state or of all; what is empty is left out.
-template <class T, class Row>
-void bind(const nb::dict& f, Fields<T, Row> fields, std::vector<Row>& rows) {
-  const size_t n = rows.size();
-  for (const auto& [name, field, size] : fields) {
-    const auto numbers = value<Array<T>>(f, name);
-    const size_t step = numbers.size() == n * size ? size : 0;
-    check(step > 0 || numbers.size() == static_cast<size_t>(size) || numbers.size() == 0);
-    for (size_t i = 0; i < n && numbers.size() > 0; i++) rows[i].*field = numbers.data() + i * step;
-  }
+// Makes the steps of n states from what was read. Returns false where a mass matrix has no factor.
+bool make_steps(int threads, const Dynamics& s, const nb::dict& f, const nb::dict& found) {
+  const int nv = s.nv, nx = s.nx(), k = size_in(f)("normal", 1);
+  const size_t n = size_in(f)("x", 0);
+  std::vector<Moving> given(n);
+  bind<const bool, Moving>(f, {{"unstable", &Moving::unstable, 1}}, given);
+  bind<const double, Moving>(
+      f, {{"x", &Moving::x, nx}, {"middle", &Moving::middle, nx}, {"acceleration", &Moving::acceleration, nv + s.na},
+          {"rates", &Moving::rates, (nv + s.na) * (nx + s.nu)}, {"inverse_mass", &Moving::inverse_mass, nv * nv},
+          {"reached", &Moving::reached, nx}, {"secant", &Moving::secant, nx * s.nu}, {"normal", &Moving::normal, k * nv},
+          {"damping", &Moving::damping, k}, {"firm", &Moving::firm, k}},
+      given);
+  std::vector<Step> into(n);
+  bind<double, Step>(found, {{"step", &Step::step, nx * s.columns()}, {"delayed", &Step::delayed, 2 * nv * s.columns()},
+                             {"response", &Step::response, nv * nv}, {"inverse_mass", &Step::inverse_mass, nv * nv},
+                             {"place", &Step::place, nv}},
+                     into);
+  std::vector<StepMaker> makers(threads, StepMaker(s));
+  std::atomic<bool> fine{true};
+  on_threads(threads, n, [&](size_t thread, int64_t i) {
+    if (!makers[thread].make(given[i], k, into[i])) fine = false;
+    return true;
+  });
+  return fine;
 }
 
 // Evaluates n states at the nominal action. Returns in how many forces were not found exactly.
 int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
-  const auto size = [&](const char* name, int axis) {
-    return static_cast<int>(value<nb::ndarray<nb::device::cpu>>(f, name).shape(axis));
-  };
+  const auto size = size_in(f);
   Common c{};
   c.nv = size("tangent", 3);
   c.nx = size("x", 1);
@@ -328,10 +388,10 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
   check(size("rough", 0) == c.contacts && size("firm", 0) == c.nv && size("tree", 0) == c.nv &&
         size("reach", 0) == c.columns - 1 - c.nx);
   for (auto [name, into] : {std::pair{"rough", &c.rough}, {"firm", &c.firm}})
-    *into = value<Array<const bool>>(f, name).data();
+    *into = array<const bool>(f, name).data();
   for (auto [name, into] : {std::pair{"time", &c.time}, {"depth", &c.depth}, {"creep", &c.creep}, {"reach", &c.reach}})
-    *into = value<Array<const double>>(f, name).data();
-  c.tree = value<Array<const int64_t>>(f, "tree").data();
+    *into = array<const double>(f, name).data();
+  c.tree = array<const int64_t>(f, "tree").data();
   const size_t n = size("x", 0);
   const int k = c.contacts, r = c.rows, nv = c.nv, t = c.tangents, of_step = c.nx * c.columns;
   std::vector<Acting> given(n);
@@ -345,7 +405,7 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
           {"delayed", &Acting::delayed, 2 * nv * c.columns}, {"response", &Acting::response, nv * nv},
           {"inverse_mass", &Acting::inverse_mass, nv * nv}},
       given);
-  const auto geom = value<Array<const int64_t>>(f, "geom");
+  const auto geom = array<const int64_t>(f, "geom");
   check(geom.size() == 2 * n * k);
   for (size_t i = 0; i < n; i++) given[i].geom = geom.data() + 2 * k * i;
   std::vector<Evaluated> into(n);
@@ -369,11 +429,10 @@ int evaluate_nominal(int threads, const nb::dict& f, const nb::dict& found) {
 // Assembles systems of n states, of arrays of each state or of all by the names of `Given`, into those of `Matrices`.
 // Returns false where numbers have to say whether F + Fᵀ is positive definite.
 bool assemble(int threads, double drag, double length, double force, const nb::dict& f, const nb::dict& found) {
-  using In = Array<const double>;
-  const auto size = [&](const char* name, int axis) { return static_cast<int>(value<In>(f, name).shape(axis)); };
+  const auto size = size_in(f);
   const int k = size("tangent", 1), t = size("tangent", 2), nv = size("tangent", 3), nx = size("x", 1);
   const int others = size("other_gap", 1), held = size("bound", 1), caps = size("cap", 1);
-  const int nu = static_cast<int>(value<Array<double>>(found, "E").shape(2));
+  const int nu = static_cast<int>(array<double>(found, "E").shape(2));
   const Layout s{nv, nx, nu, k, t, caps, others, held, length, force, drag};
   const int all = s.forces();
   const size_t n = size("x", 0);
@@ -398,6 +457,31 @@ bool assemble(int threads, double drag, double length, double force, const nb::d
   return definite;
 }
 
+// Corrects C and d of systems at n states; `doubtful` (n) where more is corrected than moves.
+void correct(int threads, double still, const nb::dict& f, Array<bool> doubtful) {
+  const auto size = size_in(f);
+  const auto tree = array<const int64_t>(f, "of_tree");
+  const int nv = static_cast<int>(tree.size()), nx = size("x", 1), nu = size("idle", 1), all = size("lam", 1);
+  const int bounded = size("bound", 1), rows = size("normal", 1), contacts = size("hard", 1);
+  const Corrected s{nv, nx, nu, value<int>(f, "trees"), contacts, rows - bounded, bounded, value<int>(f, "forces"), all,
+                    still, value<bool>(f, "presses"), tree.data(), array<const double>(f, "reach").data()};
+  check(contacts + rows <= s.forces && s.forces <= all && size("reach", 0) == nu && nx >= 2 * nv);
+  const size_t n = doubtful.size();
+  std::vector<Known> given(n);
+  bind<const bool, Known>(f, {{"hard", &Known::hard, contacts}}, given);
+  bind<const double, Known>(
+      f, {{"A", &Known::A, nx * nx}, {"B", &Known::B, nx * nu}, {"x", &Known::x, nx}, {"idle", &Known::idle, nu},
+          {"lam", &Known::lam, all}, {"after", &Known::after, nx}, {"bound", &Known::bound, bounded},
+          {"normal", &Known::normal, rows * nv}, {"step", &Known::step, nx * (nx + nu + 1)},
+          {"inverse_mass", &Known::inverse_mass, nv * nv}},
+      given);
+  bind<double, Known>(f, {{"C", &Known::C, nx * all}, {"d", &Known::d, nx}}, given);
+  on_threads(threads, n, [&](size_t, int64_t i) {
+    doubtful.data()[i] = correct_state(s, given[i]);
+    return true;
+  });
+}
+
 }  // namespace
 
 NB_MODULE(_mujoco, m) {
@@ -410,12 +494,12 @@ NB_MODULE(_mujoco, m) {
       .def(nb::new_(&make_place), "fields"_a);
   nb::class_<Motion>(m, "Motion", "Models that are simulated and linearised, by addresses. They must outlive it.")
       .def(nb::new_(&make_motion), "fields"_a);
+  nb::class_<Dynamics>(m, "Dynamics", "How steps without contact are made.").def(nb::new_(&make_dynamics), "fields"_a);
   m.def("find_contacts", &find_contacts, "library"_a, "scene"_a, "places"_a, "qpos"_a, "within"_a, "gap"_a, "normal"_a,
         "tangent"_a, "friction"_a, "geom"_a, "near"_a,
         "Contacts of many states. Returns where MuJoCo said an error or warned.");
-  m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
-        "acceleration"_a, "rates"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
-        "Motion at many states. Returns where MuJoCo said an error or warned.");
+  m.def("read_motion", &read_motion, "library"_a, "motion"_a, "dynamics"_a, "places"_a, "state"_a, "ctrl"_a,
+        "found"_a, "Motion at many states. Returns where MuJoCo said an error or warned.");
   m.def("read_rest", &read_rest, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "inverse_mass"_a, "force"_a,
         "nominal"_a, "length"_a, "moment"_a, "tendon"_a,
         "Motion at rest at many states. Returns where MuJoCo said an error or warned.");
@@ -423,10 +507,14 @@ NB_MODULE(_mujoco, m) {
         "Tendons at many positions. Returns where MuJoCo said an error or warned.");
   m.def("simulate", &simulate, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "after"_a,
         "Steps from many states. Returns where MuJoCo said an error.");
-  m.def("solve_forces", &solve_forces, "c"_a, "threads"_a, "F"_a, "q"_a, "low"_a, "high"_a, "lam"_a, "found"_a,
-        "Forces between bounds.");
+  m.def("solve_forces", &solve_forces, "compliance"_a, "threads"_a, "system"_a, "x"_a, "u"_a, "low"_a, "high"_a, "lam"_a,
+        "found"_a, "Forces of systems between bounds.");
   m.def("assemble", &assemble, "threads"_a, "drag"_a, "length"_a, "force"_a, "given"_a, "found"_a,
         "Systems of many states. Returns whether F + Fᵀ is positive definite for certain.");
+  m.def("make_steps", &make_steps, "threads"_a, "dynamics"_a, "given"_a, "found"_a,
+        "Steps of many states. Returns false where a mass matrix has no factor.");
+  m.def("correct", &correct, "threads"_a, "still"_a, "fields"_a, "doubtful"_a,
+        "Corrects systems by MuJoCo's own step.");
   m.def("evaluate_nominal", &evaluate_nominal, "threads"_a, "given"_a, "found"_a,
         "Contacts and rows at the nominal action. Returns in how many states forces were not found exactly.");
 }

@@ -36,6 +36,7 @@ struct Motion {
 // One row of each array of `Linearised` in motion.py.
 struct Linearised {
   double *middle, *acceleration, *rates, *inverse_mass, *nominal, *reached;
+  bool* unstable;
 };
 
 // Reads the motion at a state of qpos, qvel and act, with nominal controls, NaN where actuators have no force.

@@ -3,11 +3,10 @@
 
 #include <limits>
 
-#include "forces.hpp"
+#include "matrices.hpp"
 
 namespace difflcs::physics {
 
-constexpr double kTiny = 1e-300;                       // beside a divisor that may be zero
 constexpr double kGains = 1.0;                         // of the speeds before and without contact: more is a jam
 constexpr double kActsFrom = 0.6, kActsTo = 1.25;      // part of a step in which a force moves things; from .5 on an
                                                        // impact would bounce with its speed
@@ -44,10 +43,6 @@ struct Acting {
 struct Evaluated {
   double *soft, *opened, *turned, *forces, *scaled_gap, *scaled_normal, *impulse, *bound, *unit, *row_forces, *carried;
 };
-
-inline bool is_zero(const double* row, int n) {
-  return std::all_of(row, row + n, [](double x) { return x == 0; });
-}
 
 // How far a unit of force along a row moves it.
 inline double give_way(const double* row, const double* R, int nv) {
@@ -427,8 +422,8 @@ class Evaluation {
     const Common& c = *common_;
     const Acting& a = *acting_;
     const int nv = c.nv;
-    rows_.clear();
-    by_.clear();
+    rows_.resize(0, nv);
+    by_.resize(0, 1);
     for (int j = 0; j < c.rows; j++) put(&held_[j * nv], -dot(&held_[j * nv], place_.data(), nv));
     push();
     for (int v = 0; v < nv; v++) ways_[v] += place_[v];
@@ -439,8 +434,8 @@ class Evaluation {
     }
     while (count > std::max(before, 0)) {
       before = count;
-      rows_.clear();
-      by_.clear();
+      rows_.resize(0, nv);
+      by_.resize(0, 1);
       for (int i = 0; i < c.contacts; i++)
         if (closing_[i]) put(a.normal + i * nv, -norm_[i]);
       for (int j = 0; j < c.rows; j++) put(&held_[j * nv], 0.0);
@@ -451,14 +446,15 @@ class Evaluation {
   }
 
   void put(const double* row, double by) {
-    rows_.insert(rows_.end(), row, row + common_->nv);
-    by_.push_back(by);
+    if (is_zero(row, common_->nv)) return;
+    rows_.append(row);
+    by_.append(&by);
   }
 
   // Move ζ along these rows by so much.
   void push() {
-    push_of(acting_->response, rows_.data(), rows_.data(), by_.data(), static_cast<int>(by_.size()), common_->nv, 1,
-            ways_.data());
+    push_of(acting_->response, rows_, rows_, by_, pushing_);
+    ways_ = pushing_.numbers;
   }
 
   // Write the addition to the step where contacts slide by `slide_` or, with zeros, hold.
@@ -466,28 +462,26 @@ class Evaluation {
     const Common& c = *common_;
     const Acting& a = *acting_;
     const int nv = c.nv, t = c.tangents;
-    std::vector<double>& forces = spare_;
-    rows_.clear();
-    forces.clear();
+    rows_.resize(0, nv);
+    by_.resize(0, nv);
     for (int side = 0; side < 2; side++) {
       for (int i = 0; i < c.contacts; i++) {
         // What touches without a load may have one with another action.
         if (!closing_[i] && !(a.gap[i] < 0)) continue;
         std::copy_n(a.normal + i * nv, nv, drag_.data());
         if (closing_[i] && slides(i)) subtract_drag(i);
-        split(a.normal + i * nv, drag_.data(), side, forces);
+        split(a.normal + i * nv, drag_.data(), side);
       }
       for (int r = 0; r < t; r++)
         for (int i = 0; i < c.contacts; i++)
           if (closing_[i] && !slides(i) && a.friction[i] > 0)
-            split(into_->turned + (i * t + r) * nv, into_->turned + (i * t + r) * nv, side, forces);
-      for (int j = 0; j < c.rows; j++) split(&held_[j * nv], &held_[j * nv], side, forces);
+            split(into_->turned + (i * t + r) * nv, into_->turned + (i * t + r) * nv, side);
+      for (int j = 0; j < c.rows; j++) split(&held_[j * nv], &held_[j * nv], side);
     }
     // As far along the rows as what is delayed.
-    push_of(a.response, rows_.data(), forces.data(), rows_.data(), static_cast<int>(rows_.size()) / nv, nv, nv,
-            pushed_.data());
+    push_of(a.response, rows_, by_, rows_, pushing_);
     for (int i = 0; i < 2 * nv; i++)
-      multiply(&pushed_[i % nv * nv], a.delayed + i / nv * nv * c.columns, nv, c.columns,
+      multiply(pushing_[i % nv], a.delayed + i / nv * nv * c.columns, nv, c.columns,
                into_->carried + i * c.columns);
   }
 
@@ -510,16 +504,13 @@ class Evaluation {
 
   // Add the part of a row, and of a force, that moves the first body of the pair, or the last, by the trees of degrees
   // of freedom.
-  void split(const double* row, const double* force, int side, std::vector<double>& forces) {
-    const size_t begin = rows_.size();
+  void split(const double* row, const double* force, int side) {
     append(row, side, rows_);
-    append(force, side, forces);
-    if (!is_zero(&rows_[begin], common_->nv)) return;
-    rows_.resize(begin);
-    forces.resize(begin);
+    if (is_zero(rows_[rows_.rows - 1], common_->nv)) return rows_.pop();
+    append(force, side, by_);
   }
 
-  void append(const double* row, int side, std::vector<double>& into) const {
+  void append(const double* row, int side, Matrix& into) const {
     const Common& c = *common_;
     int64_t first = std::numeric_limits<int64_t>::max(), last = std::numeric_limits<int64_t>::min();
     for (int v = 0; v < c.nv; v++) {
@@ -527,9 +518,9 @@ class Evaluation {
       first = std::min(first, c.tree[v]);
       last = std::max(last, c.tree[v]);
     }
+    into.append(row);
     for (int v = 0; v < c.nv; v++)
-      into.push_back(side == 0 ? (c.tree[v] == first ? row[v] : 0.0)
-                               : (c.tree[v] == last && last > first ? row[v] : 0.0));
+      if (c.tree[v] != (side == 0 ? first : last) || (side > 0 && last == first)) into[into.rows - 1][v] = 0;
   }
 
   // Write how far contacts slide as bodies move by ζ.
@@ -560,7 +551,7 @@ class Evaluation {
     bool some = false;
     // The drag of Stewart and Trinkle's model holds what slides.
     for (int i = 0; i < c.contacts; i++) some |= slides_[i] = c.opens && size(i, moved_.data()) > creep;
-    if (!some || is_zero_mask(c.firm, nv)) return some;
+    if (!some || is_zero(c.firm, nv)) return some;
     // What robots touch may hold with another action than the nominal one, with which they do not give way.
     for (int v = 0; v < nv; v++)
       for (int w = 0; w < nv; w++) pushed_[v * nv + w] = c.firm[v] || c.firm[w] ? 0.0 : a.response[v * nv + w];
@@ -570,10 +561,6 @@ class Evaluation {
     for (int i = 0; i < c.contacts; i++) some |= slides_[i] = slides_[i] && size(i, moved_.data()) > creep;
     moved_ = fast_;
     return some;
-  }
-
-  static bool is_zero_mask(const bool* mask, int n) {
-    return std::none_of(mask, mask + n, [](bool is) { return is; });
   }
 
   // The gap of a contact after a step, by its normal force, see `Recovery`.
@@ -643,7 +630,7 @@ class Evaluation {
   std::vector<double> place_, carried_place_;  // ζ and ν afterwards: without contact, and as loads are carried
   std::vector<double> moved_, ways_, fast_, drag_, along_, closed_, gap_, norm_, slide_, forces_, held_, pushed_,
       spare_;
-  std::vector<double> rows_, by_;
+  Matrix rows_, by_, pushing_;
   std::vector<char> closing_, slides_;
   Rays rays_;
 };
