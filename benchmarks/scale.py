@@ -96,11 +96,11 @@ def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]
 
 
 @torch.no_grad()
-def time_hand(loops: int, limits: int | None, each: int) -> None:
-    """Print CPU milliseconds of plans of a hand with so many contacts of a finger."""
+def time_hand(loops: int, limits: int | None, each: int, palm: int) -> None:
+    """Print CPU milliseconds of plans of a hand with so many contacts of each finger, and of the palm."""
     env, met = HandTurnObjectEnv(), []
     groups = [ContactGroup([("object", f"{finger}_{link}") for link in LINKS], each) for finger in FINGERS]
-    groups += [ContactGroup(("object", "palm"), 2 + each // 2), ContactGroup(None, 2 * each, False, 0.006)]
+    groups += [ContactGroup(("object", "palm"), palm), ContactGroup(None, 2 * each, False, 0.006)]
     system = hand_system(env.model, contacts=groups, limits=limits)
     layer = LCSMPCLayer(system, hand_cost(system), 4, -0.05, 0.05, relaxation=1e-3, on_failure="mask")
     for seed in range(loops):
@@ -127,8 +127,8 @@ def main(o: Options) -> None:
     """Measure, print, write."""
     torch.set_num_threads(1)
     if o.hand:
-        for limits, each in ((0, 2), (None, 2), (0, 4)):
-            time_hand(o.hand, limits, each)
+        for limits, each, palm in ((0, 2, 1), (0, 2, 3), (None, 2, 3), (0, 4, 2)):
+            time_hand(o.hand, limits, each, palm)
         return
     warnings.simplefilter("ignore")  # what fails is counted
     random, carts, horizons, models, few = RANDOM, CARTS, HORIZONS, WEAK_MODELS, WEAK_PROBLEMS
