@@ -43,7 +43,7 @@ constexpr double kEqual = 3e-4;
 // Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
 // A bound that is this many times farther than that plan counts as none.
 constexpr double kReach = 3.0, kNone = 100.0;
-// Directions of a cost's weights below this part of the largest count as flat. Objectives equal to this part are the same.
+// Directions of a cost's weights below this part of the largest count as flat. Equal to this part is rounding.
 constexpr double kFlat = 1e-12, kRounded = 1e-9;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
@@ -227,14 +227,17 @@ int64_t finders(const double* reached, int64_t count, double one, double size) {
   return std::count_if(reached, reached + count, [&](double v) { return std::abs(v - one) <= kEqual * size; });
 }
 
-// The least value of z'Wz / 2 + w'z where W is positive semidefinite, along the directions in which it is positive. Its
-// lower triangle and w are overwritten.
+// The least value of z'Wz / 2 + w'z where W is positive semidefinite, or minus infinity, as w may fall along a direction
+// that is flat. The lower triangle of W and w are overwritten.
 double least_value(int64_t n, double* W, double* w) {
-  double value = 0.0, largest = 0.0;
+  double value = 0.0, largest = 0.0, steepest = 0.0;
   for (int64_t i = 0; i < n; i++) largest = std::max(largest, W[i * n + i]);
+  for (int64_t i = 0; i < n; i++) steepest = std::max(steepest, std::abs(w[i]));
   for (int64_t i = 0; i < n; i++) {
     const double pivot = W[i * n + i];
-    if (!(pivot > kFlat * largest)) continue;
+    const bool flat = !(pivot > kFlat * largest);
+    if (flat && std::abs(w[i]) > kRounded * steepest) return -std::numeric_limits<double>::infinity();
+    if (flat) continue;
     value -= 0.5 * w[i] * w[i] / pivot;
     for (int64_t j = i + 1; j < n; j++) {
       const double part = W[j * n + i] / pivot;

@@ -108,7 +108,7 @@ class MpcSearch {
               int64_t count);
   double least_cost(const MpcBatch& batch, int64_t e);
   // What an objective of an element is compared in parts of: its size, or what it is above the least that its stages can
-  // cost, if that is less. So another origin of the states changes nothing.
+  // cost, if there is one and that is less. So another origin of the states changes nothing.
   double size(int64_t e, double objective) const;
   // The objective below which a job must come that is to be better than a plan of this one, by more than kEqual.
   double needed(int64_t e, double objective) const;
@@ -128,11 +128,10 @@ class MpcSearch {
   std::vector<int64_t> agreed, found;         // how many groups and starts have found the best plan of each
   std::vector<int64_t> ended;                 // how many starts of one group have found the plan of the group
   std::vector<int64_t> live, idle, patience;  // elements still searched, rounds without gain, and how many are enough
-  std::vector<double> dearer;   // how much more the starts of a round cost than the plan of each
-  std::vector<double> lowest;         // what the stages of each element cost at least
-  std::vector<double> weight, slope;  // of the cost of a stage
-  std::vector<double> closing;  // costates of a gap, at a stage and at the next
-  std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
+  std::vector<double> dearer;                 // how much more the starts of a round cost than the plan of each
+  std::vector<double> lowest, weight, slope;  // what the stages of each element cost at least; of the cost of a stage
+  std::vector<double> closing;                // costates of a gap, at a stage and at the next
+  std::vector<int64_t> origin;                // the job, or the element, that each of some problems comes from
 };
 
 }  // namespace difflcs
