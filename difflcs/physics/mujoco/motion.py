@@ -89,10 +89,8 @@ class Dynamic:
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
-        self.loosens = model.neq > 0 or self.steps.integrator in (
-            _RK4,
-            _DISCRETE,
-        )  # without constraints it moves otherwise
+        # Whether it moves otherwise without constraints.
+        self.loosens = model.neq > 0 or self.steps.integrator in (_RK4, _DISCRETE)
 
     def _native(self, steps: Steps, loose: bool = False) -> _mujoco.Motion:
         """Describe steps once; `loose`: without constraints, implicit, as stiff drives that nothing holds overshoot."""

@@ -12,6 +12,7 @@ from difflcs.physics import complementarity
 from difflcs.physics.complementarity import Bounded, Contacts, FreeMotion, Unilateral
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
+from difflcs.physics.mujoco.library import count_threads
 from difflcs.physics.mujoco.limits import ScaledRows
 from difflcs.records import SYSTEM, LCSParams
 
@@ -69,8 +70,7 @@ class Readings(NamedTuple):
             m = complementarity.count_forces(contacts.tangent.shape[1], contacts.tangent.shape[2], cone, k, n_bounded)
             sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
             found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
-            threads = max(1, min(n, torch.get_num_threads()))
-            sure = _mujoco.assemble(threads, complementarity.DRAG, length, force, given, found)
+            sure = _mujoco.assemble(count_threads(n), complementarity.DRAG, length, force, given, found)
             found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
         else:
             found, sure = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
