@@ -27,7 +27,7 @@ class Animation:
 
     Args:
         frames: arrays (height, width, 3) of uint8, such as `env.render()` returns, or Pillow images; all of one size.
-        fps: frames a second.
+        fps: frames a second, at least 0.01.
         colors: size of the palette that all frames share, at most 256; fewer make smaller files.
         dither: mix colours that the palette lacks from dots of others; makes larger files.
 
@@ -41,7 +41,7 @@ class Animation:
         require("PIL")
         from PIL import Image
 
-        self.fps, colors = check_number("fps", fps, strict=True), check_positive_int("colors", colors, maximum=256)
+        self.fps, colors = check_number("fps", fps, minimum=0.01), check_positive_int("colors", colors, maximum=256)
         try:
             pictures = [one if isinstance(one, Image.Image) else Image.fromarray(np.asarray(one)) for one in frames]
         except TypeError as error:
@@ -49,10 +49,10 @@ class Animation:
                 f"frames: expected arrays (height, width, 3) of uint8, got others: {error}; convert them"
             ) from error
         sizes = sorted({picture.size for picture in pictures})
-        if len(sizes) != 1:
+        if len(sizes) != 1 or 0 in sizes[0]:
             raise InvalidInputError(
-                f"frames: expected at least one, all of one size, got {len(pictures)} of the sizes {sizes}; "
-                "draw every frame with the same width and height"
+                f"frames: expected at least one, all of one size that is not 0, got {len(pictures)} of the sizes "
+                f"{sizes}; draw every frame with the same width and height"
             )
         pictures = [picture.convert("RGB") for picture in pictures]
         sample = np.concatenate([np.asarray(picture) for picture in pictures[:: -(-len(pictures) // _SAMPLES)]])

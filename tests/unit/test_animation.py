@@ -40,9 +40,10 @@ def test_a_drawn_figure_is_saved_by_its_ending_and_closed(tmp_path):
     ("frames", "options", "message"),
     [
         ([], {}, "of one size"),
+        ([FRAMES[0][:0]], {}, "of one size that is not 0"),
         ([FRAMES[0], FRAMES[0][:4]], {}, "of one size"),
         ([FRAMES[0] / 255], {}, "frames: expected arrays .* of uint8"),
-        (FRAMES, {"fps": 0}, "fps: expected a finite number above 0"),
+        (FRAMES, {"fps": 0.001}, "fps: expected a finite number at least 0.01"),
         (FRAMES, {"colors": 257}, "colors: expected at most 256"),
     ],
 )
