@@ -37,11 +37,11 @@ import torch
 import tyro
 from recorded import Recorded
 from successes import success_figures, success_text
-from trifinger_turn import yaw_quaternion
+from trifinger_turn import choose_objects, yaw_quaternion
 
 from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save
-from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.errors import ContactWarning
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import Effort, MujocoCost, Orientation, Position
 from difflcs.planning.mujoco import Rehearsal
@@ -331,12 +331,7 @@ def figures(episodes: list[dict[str, Any]]) -> dict[str, Any]:
 def main(o: Options) -> None:
     """Play, print, record."""
     there = [name for name in OBJECTS if (o.assets / "xmls" / f"env_allegro_{name}.xml").exists()]
-    names = there if o.objects == "all" else o.objects.split(",")
-    if not names or set(names) - set(there):
-        raise InvalidInputError(
-            f"objects: expected some of {', '.join(there) or 'nothing'}, whose files are in {o.assets}, got "
-            f"{o.objects!r}; pass --assets DIR with the published xmls/env_allegro_*.xml"
-        )
+    names = choose_objects(o.objects, there, o.assets, "env_allegro_*.xml")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
     recorded, results, episodes = Recorded(partial(play, o), o.out), {}, []

@@ -328,15 +328,21 @@ def is_there(folder: Path, name: str) -> bool:
     return True
 
 
+def choose_objects(asked: str, there: list[str], assets: Path, files: str) -> list[str]:
+    """Return the names that are asked for, "all" or some with commas between them, if they are there."""
+    names = there if asked == "all" else asked.split(",")
+    if not names or set(names) - set(there):
+        raise InvalidInputError(
+            f"objects: expected some of {', '.join(there) or 'nothing'}, whose files are in {assets}, got "
+            f"{asked!r}; pass --assets DIR with the published xmls/{files}"
+        )
+    return names
+
+
 def main(o: Options) -> None:
     """Play, print, record."""
     there = [name for name in HEIGHTS if is_there(o.assets, name)]
-    names = there if o.objects == "all" else o.objects.split(",")
-    if not names or set(names) - set(there):
-        raise InvalidInputError(
-            f"objects: expected some of {', '.join(there) or 'nothing'}, whose files are in {o.assets}, got "
-            f"{o.objects!r}; pass --assets DIR with the published xmls/env_trifinger_*.xml"
-        )
+    names = choose_objects(o.objects, there, o.assets, "env_trifinger_*.xml")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
     recorded = Recorded(partial(play, o), o.out)
