@@ -18,11 +18,10 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #include "bind_controller.hpp"
+#include "crew.hpp"
 #include "kernels.hpp"
 #include "search.hpp"
 
@@ -97,23 +96,16 @@ template <class Work>
 void on_threads(int64_t threads, const AlignedBuffer& mine, Stop& stop, Work work) {
   {
     nb::gil_scoped_release release;
-    std::vector<std::thread> pool;
-    auto start = [&] {
-      auto workspace = std::make_shared<AlignedBuffer>(mine.bytes);
-      pool.emplace_back([&work, &stop, workspace] {
-        Lookout lookout{stop, false};
-        work(workspace->data.get(), difflcs::Watch{&Lookout::ask, &lookout});
-      });
-    };
-    try {
-      pool.reserve(threads);
-      for (int64_t t = 1; t < threads; t++) start();
-    } catch (const std::system_error&) {  // the work is shared by those that run
-    } catch (const std::bad_alloc&) {
-    }
-    Lookout lookout{stop, true};
-    work(mine.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
-    for (auto& t : pool) t.join();
+    difflcs::Crew::get().run(threads, [&](size_t thread) {
+      AlignedBuffer own;
+      try {
+        if (thread > 0) own = AlignedBuffer(mine.bytes);
+      } catch (const std::bad_alloc&) {
+        return;
+      }
+      Lookout lookout{stop, thread == 0};
+      work((thread > 0 ? own : mine).data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+    });
   }
   if (stop.ending == kInterrupted) throw nb::python_error();
 }

@@ -7,13 +7,14 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <stdexcept>
-#include <system_error>
-#include <thread>
 #include <vector>
+
+#include "crew.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -34,16 +35,9 @@ using GetStateFunction = void (*)(const void* model, const void* data, double* s
 template <class Work>
 void on_threads(int count, int threads, Work work) {
   std::atomic<int> next{0};
-  auto take = [&] {
+  difflcs::Crew::get().run(std::min(threads, count), [&](size_t) {
     for (int i; (i = next.fetch_add(1)) < count;) work(i);
-  };
-  std::vector<std::thread> helpers;
-  try {
-    for (int t = 1; t < threads && t < count; ++t) helpers.emplace_back(take);
-  } catch (const std::system_error&) {  // the work is shared by those that run
-  }
-  take();
-  for (std::thread& helper : helpers) helper.join();
+  });
 }
 
 // --- one simulation -------------------------------------------------------------------------------

@@ -9,11 +9,10 @@
 
 #include <atomic>
 #include <stdexcept>
-#include <system_error>
-#include <thread>
 
 #include "assembly.hpp"
 #include "correction.hpp"
+#include "crew.hpp"
 #include "finder.hpp"
 #include "forces.hpp"
 #include "motion.hpp"
@@ -168,17 +167,11 @@ void on_threads(size_t threads, int64_t count, Work work) {
   nb::gil_scoped_release release;
   std::atomic<int64_t> next{0};
   std::atomic<bool> stop{false};
-  auto take = [&](size_t thread) {
+  const auto take = [&](size_t thread) {
     for (int64_t i; !stop && (i = next.fetch_add(1)) < count;)
       if (!work(thread, i)) stop = true;
   };
-  std::vector<std::thread> pool;
-  try {
-    for (size_t t = 1; t < threads; t++) pool.emplace_back(take, t);
-  } catch (const std::system_error&) {  // the work is shared by those that run
-  }
-  take(0);
-  for (auto& t : pool) t.join();
+  difflcs::Crew::get().run(threads, take);
 }
 
 // Calls work(place, state) for all states, a thread for each place.
