@@ -96,15 +96,15 @@ template <class Work>
 void on_threads(int64_t threads, const AlignedBuffer& mine, Stop& stop, Work work) {
   {
     nb::gil_scoped_release release;
-    difflcs::Crew::get().run(threads, [&](size_t thread) {
-      AlignedBuffer own;
-      try {
-        if (thread > 0) own = AlignedBuffer(mine.bytes);
-      } catch (const std::bad_alloc&) {
-        return;
-      }
+    std::vector<AlignedBuffer> others;
+    try {
+      others.reserve(threads);
+      for (int64_t t = 1; t < threads; t++) others.emplace_back(mine.bytes);
+    } catch (const std::bad_alloc&) {
+    }
+    difflcs::Crew::get().run(others.size() + 1, [&](size_t thread) {
       Lookout lookout{stop, thread == 0};
-      work((thread > 0 ? own : mine).data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+      work((thread > 0 ? others[thread - 1] : mine).data.get(), difflcs::Watch{&Lookout::ask, &lookout});
     });
   }
   if (stop.ending == kInterrupted) throw nb::python_error();
