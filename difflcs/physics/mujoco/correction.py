@@ -65,8 +65,9 @@ class WholeStep:
         motion, nv = self.motion, self.model.nv
         ctrl = read.nominal + x[:, :nv] @ motion.moment.T
         after = self.simulate(places, states, ctrl)
-        after[read.unstable & (np.abs(after).max(1) > FAST_MOTION)] = np.nan  # unstable steps may lead anywhere
-        if (held := (np.abs(read.reached - after)[:, :nv] > _APART).any(1)).any():
+        if read.unstable.any():  # unstable steps may lead anywhere
+            after[read.unstable & (np.abs(after).max(1) > FAST_MOTION)] = np.nan
+        if (held := (np.abs(read.reached[:, :nv] - after[:, :nv]) > _APART).any(1)).any():
             again = motion.read_by(self._native, places, states[held], ctrl[held])
             for name in ("middle", "acceleration", "rates", "unstable"):
                 getattr(read, name)[held] = getattr(again, name)
@@ -117,8 +118,8 @@ def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] |
 
 def correct(
     system: LCSParams, step: DynamicStep, after: Array, bound: Array, rows: Rows, hard: Any, acts: Any
-) -> tuple[LCSParams, NDArray[np.bool_]]:
-    """Correct C and d of systems at n states; return them, and those (n,) where more is corrected than moves.
+) -> NDArray[np.bool_]:
+    """Correct C and d of systems at n states in place; return those (n,) where more is corrected than moves.
 
     Args:
         system: the systems, in any batch dimensions.
@@ -126,17 +127,17 @@ def correct(
         after: (n, 2 nv + na) after MuJoCo's step, see `WholeStep`; states with NaN stay as they are.
         bound: (n, n_bounded) of dry friction, the forces after those of limits.
         rows: limits and dry friction.
-        hard: (n, k) of the k forces of contacts, which are the first; False for those of soft contacts.
+        hard: (n or 1, k) of the k forces of contacts, which are the first; False for those of soft contacts.
         acts: (n, k) True for forces that are likely not zero; those of the limits of servos come after them.
     """
-    motion, (n, nv) = step.motion, step.place.shape
+    n, nv = step.place.shape
     lam, doubtful = find_forces(system, step.x, step.idle, acts), np.zeros(n, dtype=bool)
     if step.turn is not None:
         after = np.concatenate([step.turn_back(after[:, :nv, None].copy())[:, :, 0], after[:, nv:]], 1)
-    tensors = {name: v.contiguous() for name, v in system.tensors().items() if name in "ABCd"}
-    more = {"after": after, "bound": bound, "normal": rows.normal, "hard": hard, "reach": motion.actuators.reach}
-    given = step._asdict() | {name: np.ascontiguousarray(v) for name, v in more.items()}
-    given |= {name: v.numpy() for name, v in tensors.items()} | {"lam": lam, "of_tree": motion.of_tree}
-    given |= {"forces": acts.shape[1], "trees": len(motion.trees), "presses": bool(motion.firm.any())}
+    given = step._asdict() | step.motion.fields | {"forces": acts.shape[1], "lam": lam, "hard": hard}
+    given |= {
+        name: np.ascontiguousarray(v) for name, v in (("after", after), ("bound", bound), ("normal", rows.normal))
+    }
+    given |= {name: getattr(system, name).numpy() for name in "ABCd"}
     _mujoco.correct(count_threads(n), STILL, given, doubtful)
-    return LCSParams.of_checked({"C": tensors["C"], "d": tensors["d"]}, like=system), doubtful
+    return doubtful

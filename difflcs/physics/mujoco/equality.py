@@ -62,7 +62,7 @@ class Equality:
             InvalidInputError: MuJoCo raised an error.
         """
         model, data, rows = self.model, self.data, []
-        if not self._taken.eq_active.any() or not len(qpos):
+        if not (model.neq and self._taken.eq_active.any() and len(qpos)):
             return None
         copy_taken(data, self._taken)
         for i, q in enumerate(qpos):

@@ -25,7 +25,7 @@ from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
-from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation
+from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation, evaluate_nominal
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.quasi_static import QuasiStatic
@@ -168,6 +168,7 @@ class MujocoLCS:
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
             self._give, self._yields = _respond(self, limits != 0)
+        self._corrects = self._whole is not None and self.n_lam > 0
         self._tries = self._whole and Tries(self._whole, self._places, relative, self._yields)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -225,19 +226,19 @@ class MujocoLCS:
             InvalidInputError and its kinds: no state, or of another size.
         """
         read = self._read(x := given_states(x), context)
-        contacts, rough, rest, step, overlaps = read.dof_contacts, self._finder.rough, None, None, None
+        contacts, (rough, smooth), rest, step, overlaps = read.dof_contacts, self._finder.parts, None, None, None
         unit, loads = self.length / self._give, None
         if isinstance(self._motion, Dynamic):
             middle = read.moved.middle[:, : self.state.nv]
             step = self._motion.finish(read.moved, read.x, read.tangent, self._equality.read(read.qpos, middle))
             found = self._rows.find(read.qpos, step.place, step.response, middle)
             more = self._recovery, self._give, self.compliance, self.cone == "anitescu"
-            at = Situation(step, contacts, rough, found, *more)
+            at = Situation(step, contacts, self._finder.rough, found, *more)
             overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
-            nominal = overlaps.evaluate(at)
+            nominal = overlaps.evaluate(at) if overlaps is not None else evaluate_nominal(at)
             contacts, soft, rows = nominal.contacts, nominal.soft, nominal.rows
-            rest = nominal.rest(rough, self._finder.n_tangents, self.cone, self._caps.count)
-            loads, response = nominal.forces[:, rough].sum(-1), step.response
+            rest = nominal.rest(rough, smooth, self._finder.n_tangents, self.cone, self._caps.count)
+            loads, response = nominal.forces[:, rough].sum(-1) if self._caps.count else None, step.response
             free = step.free(nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
@@ -246,8 +247,8 @@ class MujocoLCS:
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows, soft = scale(found, response, self._give), np.full_like(contacts.gap, self.compliance)
         caps = self._caps.limit(contacts, loads, response, unit)
-        if not rough.all():
-            rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
+        if n_smooth := contacts.gap[:, smooth].shape[1]:
+            rows = rows.after(contacts.gap[:, smooth], contacts.normal[:, smooth])
             contacts = contacts.take(np.s_[:, rough])
         effect = None if step is None else step.effect(rows.normal, rows.impulse)
         soft = soften(rows, found, step, self._give, self.compliance, soft[:, rough])
@@ -255,10 +256,13 @@ class MujocoLCS:
         if self.motion == "quasi-dynamic":
             _rest_on_forces(self, system, read, response)
         system = self._servos.limit(system, free, step, read, self.length, self._give)
-        if step is not None and overlaps is not None and read.after is not None:
-            hard = overlaps.find_hard(rough, count_forces(1, self._finder.n_tangents, self.cone), self._caps.count)
-            more = rows.bound / unit, found, hard, rest != 0
-            system, read.doubtful[:] = correct(system, step, read.after, *more)
+        if step is not None and read.after is not None:
+            sizes = count_forces(1, self._finder.n_tangents, self.cone), n_smooth + self._caps.count
+            if overlaps is None:
+                hard = np.ones((1, sizes[0] * contacts.gap.shape[1] + sizes[1]), dtype=bool)
+            else:
+                hard = overlaps.find_hard(rough, *sizes)
+            read.doubtful[:] = correct(system, step, read.after, rows.bound / unit, found, hard, rest != 0)
         if step is not None and self._tries is not None:
             self._tries.warn(system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -319,13 +323,13 @@ class MujocoLCS:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
         flat = np.ascontiguousarray(to_numpy(x).reshape(n, self.n_x))
-        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, self.n_u)
-        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._caps.order(self._finder.find(qpos))
+        ctrl = np.repeat(self._ctrl[None], n, 0) if context is None else self._actuators.nominal(context, batch)
+        ctrl, found = ctrl.reshape(n, self.n_u), self._caps.order(self._finder.find(qpos))
         tangent = self.state.tangent(flat[:, : self.state.nv])
         moved, after = self._motion.read(self._places, states, ctrl), None
         if isinstance(self._motion, Dynamic):
             moved = self._motion.find_secants(moved, self._places, states, flat)
-            if self._whole is not None and self.n_lam:
+            if self._whole is not None and self._corrects:
                 after = self._whole.hold(moved, self._places, states, flat)
         return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool), after)
 

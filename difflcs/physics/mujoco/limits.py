@@ -68,7 +68,7 @@ class Rows(NamedTuple):
         gap: (n, k) distance from where the limit acts; zero for friction.
         normal: (n, k, nv) derivative of the gap, or of the way that rubs, by the degrees of freedom.
         bend: (n, k) how much more the gap of a tendon grows in the step than its derivative says.
-        soft: softness, (n, k).
+        soft: softness, (k,) or (n, k).
         n_friction: number of rows of friction.
     """
 
@@ -135,6 +135,9 @@ class RowFinder:
         self._range = np.concatenate([model.jnt_range[joints], model.tendon_range[tendons]])
         self._range[len(self._joints) : len(joints), 0] = -np.inf  # balls have the largest angle alone
         dofs, rubbing, rubbing_tendons = model.jnt_dofadr[joints], self._rubbing, self._rubbing_tendons
+        self._addresses, unit = model.jnt_qposadr[self._joints], np.eye(model.nv)
+        self._along, self._rubs = np.zeros((of_limits, model.nv)), unit[rubbing]
+        self._along[: len(self._joints)] = unit[dofs[: len(self._joints)]]
         self._soft = Softness(
             *_reference(
                 model,
@@ -169,8 +172,7 @@ class RowFinder:
             none = np.zeros((n, 0))
             return Rows(none, np.zeros((n, 0, nv)), none, self._soft, 0)
         normal, gap, bend, tendons = self._limits(qpos, place, middle)
-        where = np.arange(n)[:, None]
-        chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
+        soft, where = self._soft, np.arange(n)[:, None]
         if self.n_limits < gap.shape[1]:
             gives = give_way(normal, response)
             after = np.minimum(gap, gap + (normal @ place[:, :, None])[:, :, 0])
@@ -179,24 +181,25 @@ class RowFinder:
             after = np.where(gives > 0, after / np.sqrt(np.maximum(gives, 1e-300)), np.inf)
             chosen = np.sort(np.argpartition(after, self.n_limits, -1)[:, : self.n_limits])
             normal, gap, bend = normal[where, chosen], gap[where, chosen], bend[where, chosen]
-        rubbing = np.zeros((n, len(self._rubbing), nv))
-        rubbing[:, np.arange(len(self._rubbing)), self._rubbing] = 1.0
-        normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
-        of_friction = np.arange(len(self._range), len(self._soft.bound))
-        chosen = np.concatenate([chosen, np.broadcast_to(of_friction, (n, self.n_friction))], 1)
-        gap, bend = (np.concatenate([values, np.zeros((n, self.n_friction))], 1) for values in (gap, bend))
-        return Rows(gap, normal, bend, self._soft.at(chosen), self.n_friction)
+            of_friction = np.arange(len(self._range), len(self._soft.bound))
+            soft = soft.at(np.concatenate([chosen, np.tile(of_friction, (n, 1))], 1))
+        if self.n_friction:
+            rubbing = np.repeat(self._rubs[None], n, 0)
+            normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
+            gap, bend = (np.concatenate([values, np.zeros((n, self.n_friction))], 1) for values in (gap, bend))
+        return Rows(gap, normal, bend, soft, self.n_friction)
 
     def _limits(self, qpos: Array, place: Array, middle: Array | None) -> tuple[Array, Array, Array, Array]:
         """Return of all limits, of the nearer side after the step, derivatives (n, k, nv), gaps (n, k) and bends.
 
         And the derivatives (n, ntendon, nv) of all tendons' lengths.
         """
-        model, (n, nv) = self.model, place.shape
+        model, n = self.model, len(place)
         k, balls = len(self._joints), len(self._balls)
-        value, along = np.zeros((n, len(self._range))), np.zeros((n, len(self._range), nv))
-        value[:, :k] = qpos[:, model.jnt_qposadr[self._joints]]
-        along[:, np.arange(k), model.jnt_dofadr[self._joints]] = 1.0
+        value, along = np.zeros((n, len(self._range))), self._along
+        value[:, :k] = qpos[:, self._addresses]
+        if k < len(along):
+            along = np.repeat(along[None], n, 0)
         for row, joint in enumerate(self._balls, k):
             address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
             quaternion = qpos[:, address : address + 4]
@@ -205,11 +208,12 @@ class RowFinder:
             value[:, row] = 2 * np.arctan2(sine, quaternion[:, 0])
             along[:, row, dof : dof + 3] = quaternion[:, 1:] / np.maximum(sine, 1e-12)[:, None]
         length, tendons = self._read_tendons(qpos)
-        value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
+        if len(self._tendons):
+            value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
         lower, upper = value - self._range[:, 0], self._range[:, 1] - value
         moved = (along @ place[:, :, None])[:, :, 0]
         side = np.where(lower + moved < upper - moved, 1.0, -1.0)
-        gap, bend = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)], np.zeros_like(side)
+        gap, bend = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)], np.zeros(side.shape)
         if middle is not None and len(self._tendons):
             halfway = qpos.copy()
             for q, change in zip(halfway, middle, strict=True):
@@ -260,7 +264,7 @@ def soften(
     rows: ScaledRows, found: Rows, step: DynamicStep | None, give: float, compliance: float, contacts: Array
 ) -> Array:
     """Compliance (n, n_contacts + k) of contacts and rows; friction in a step with velocities creeps as MuJoCo's."""
-    soft = np.concatenate([contacts, np.full_like(rows.gap, compliance)], 1)
+    soft = np.concatenate([contacts, np.full(rows.gap.shape, compliance)], 1)
     if step is not None and (n := found.n_friction):
         creeps = found.soft.yields(give_way(found.normal, step.inverse_mass), step.seconds)[:, -n:] / give
         soft[:, -n:] = np.maximum(compliance, rows.unit[:, -n:] ** 2 * creeps)

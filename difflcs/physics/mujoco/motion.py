@@ -85,9 +85,21 @@ class Dynamic:
         self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
         self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
         self.in_tree = self.tree[:, None] == self.trees  # (nv, n_trees)
-        self.firm = np.isin(  # those of trees with an actuator at every joint
+        firm = np.isin(  # those of trees with an actuator at every joint
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
+        self.fields = {
+            "tree": self.tree.astype(np.int64),
+            "of_tree": self.of_tree,
+            "trees": len(self.trees),
+            "firm": firm,
+            "presses": bool(firm.any()),
+            "reach": actuators.reach,
+            "steps": count,
+            "seconds": seconds,
+        }
+        self._hinges = model.nv + np.flatnonzero(model.jnt_type[model.dof_jntid] == _HINGE)
+        self._bends = np.isin(np.arange(model.nu), actuators.curved)
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
         # Whether it moves otherwise without constraints.
         self.loosens = model.neq > 0 or self.steps.integrator in (_RK4, _DISCRETE)
@@ -106,7 +118,8 @@ class Dynamic:
             InvalidInputError: MuJoCo raised an error, or has counted a warning.
         """
         read = self.read_by(self._native(self.simulated), places, states, ctrl)
-        if (unstable := read.unstable.copy()).any():
+        if read.unstable.any():
+            unstable = read.unstable.copy()
             again = self.read_by(self._native(self.finer), places, states[unstable], ctrl[unstable])
             for values, better in zip(read, again, strict=True):
                 values[unstable] = better
@@ -119,24 +132,24 @@ class Dynamic:
         Where a joint turns far in a step, what is linear half way says little, and differences of the simulation stand
         for all actuators. The states are those of MuJoCo and of the system, (n, n_x).
         """
-        nv, nu, curved = self.model.nv, self.model.nu, self.actuators.curved
-        hinges = self.model.jnt_type[self.model.dof_jntid] == _HINGE
-        fast = (self.seconds * np.abs(x[:, nv : 2 * nv][:, hinges]) > _FAR).any(-1) & ~read.unstable
+        curved, bends, moment = self.actuators.curved, self._bends, self.moment
+        fast = (self.seconds * np.abs(x[:, self._hinges]) > _FAR).any(-1) & ~read.unstable
         if not (fast.any() or curved.size):
             return read
-        ctrl, bends = read.nominal + x[:, :nv] @ self.moment.T, np.isin(np.arange(nu), curved)
+        ctrl = read.nominal + x[:, : moment.shape[1]] @ moment.T
         low, high = self.actuators.range[:, None] - ctrl
         size = _DIFFERENCE[bool(self.model.neq)] * self.actuators.reach
         near = np.where(high > -low, np.minimum(high, size), np.maximum(low, -size))
-        ends = np.zeros((4, len(x), nu))
-        ends[:, :, curved] = np.stack([low, high, 0.5 * low, 0.5 * high])[:, :, curved]
+        ends = np.zeros((4 if curved.size else 1, *ctrl.shape))
+        if curved.size:
+            ends[:, :, curved] = np.stack([low, high, 0.5 * low, 0.5 * high])[:, :, curved]
         ends[0] += near * (fast[:, None] & ~bends)
         secants = np.repeat(np.where(ends.any(0), 0.0, np.inf)[:, None], x.shape[1], 1)
         weights = ends / np.maximum((ends**2).sum(0), 1e-300)
         for kind in (bends, ~bends):
-            _, state, i = those = np.nonzero(ends * kind)
-            if not i.size:
+            if not kind.any() or not (those := np.nonzero(ends * kind))[0].size:
                 continue
+            _, state, i = those
             other = ctrl[state]
             other[np.arange(len(i)), i] += ends[those]
             taken, steps = (places, states[state], other), self._native(self.simulated)
@@ -170,15 +183,15 @@ class Dynamic:
 
     def read_by(self, described: _mujoco.Motion, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read it by the steps that are `described`, stable or not."""
-        n, nv, nu = len(states), self.model.nv, self.model.nu
-        n_x = 2 * nv + self.model.na
+        n, nv, nu, na = len(states), self.model.nv, self.model.nu, self.model.na
+        n_x = 2 * nv + na
         sizes = ((n_x,), (n_x - nv,), (n_x - nv, n_x + nu), (nv, nv), (nu,), (n_x,))
         arrays = (np.zeros((n, *size)) for size in sizes)
         read = Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
         taken = self._dynamics, places.take(n), states, np.ascontiguousarray(ctrl), read._asdict()
         places.check(_mujoco.read_motion(library(), described, *taken), n)
-        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
-        self.actuators.even_out(read.nominal, activation, read.rates)
+        if na:
+            self.actuators.even_out(read.nominal, states[:, -na:] + read.middle[:, -na:], read.rates)
         return read
 
     def describe(self, steps: Steps, disabled: int) -> _mujoco.Motion:
@@ -308,33 +321,30 @@ class DynamicStep(NamedTuple):
 
     def free(self, carried: Array) -> FreeMotion:
         """Motion without contact, with `carried` added to (ζ, ν)."""
-        motion, x, step = self.motion, self.x, self.step.copy()
-        (n, n_x), nv, turned = x.shape, motion.model.nv, self.response
+        motion, at, step, turned = self.motion, self.x.copy(), self.step.copy(), self.response
+        n_x, nv, response = at.shape[1], turned.shape[1], np.zeros((*at.shape, at.shape[1]))
         step[:, : 2 * nv] += carried
-        # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
-        control = step[:, :, n_x:-1]
-        if motion.relative.size:
-            step[:, :, :nv] += control @ motion.moment
-        step[:, :, -1:] -= control @ self.idle[:, :, None]
         self.turn_back(step)
+        A, B, d = step[:, :, :n_x].copy(), step[:, :, n_x:-1].copy(), step[:, :, -1:]
+        # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
+        if motion.relative.size:
+            A[:, :, :nv] += B @ motion.moment
         if self.turn is not None:
             those, tangent, back = self.turn
-            step[:, :, those], turned = step[:, :, those] @ tangent, turned.copy()
+            A[:, :, those], turned = A[:, :, those] @ tangent, turned.copy()
             turned[:, :, those] = turned[:, :, those] @ back.swapaxes(-1, -2)
-        at = x.copy()
         at[:, nv : 2 * nv] = 0.0
-        A_x, response = np.ascontiguousarray(step[:, :, :n_x]), np.zeros((n, n_x, n_x))
-        d = at + (step[:, :, -1:] - A_x @ at[:, :, None])[:, :, 0]
+        at += (d - B @ self.idle[:, :, None] - A @ at[:, :, None])[:, :, 0]
         response[:, :nv, :nv], response[:, nv : 2 * nv, :nv] = self.turn_back(motion.seconds * turned), turned
-        matrices: Any = A_x, np.ascontiguousarray(control), d, response
+        matrices: Any = A, B, at, response
         return FreeMotion(*matrices)
 
     def effect(self, normal: Array, impulse: Array) -> Array:
         """Compute what forces add to the next state (n, n_x, k): ζ gets h S `normal` (n, k, nv), ν S `impulse`."""
-        (n, n_x), nv = self.x.shape, self.place.shape[1]
-        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (self.seconds * normal, impulse))
-        still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
-        return np.concatenate([self.turn_back(place), velocity, still], 1)
+        nv, change = self.place.shape[1], np.zeros((*self.x.shape, normal.shape[1]))
+        change[:, :nv] = self.response @ (self.seconds * normal).swapaxes(-1, -2)
+        change[:, nv : 2 * nv] = self.response @ impulse.swapaxes(-1, -2)
+        return self.turn_back(change)
 
 
 def _find_turn(tangent: Array) -> tuple[Any, Any, Any]:

@@ -51,13 +51,13 @@ class Nominal(NamedTuple):
     row_forces: Array
     carried: Array
 
-    def rest(self, rough: NDArray[np.bool_], n_tangents: int, cone: Cone, n_caps: int) -> Array:
+    def rest(self, rough: Any, smooth: Any, n_tangents: int, cone: Cone, n_caps: int) -> Array:
         """Forces (n, n_lam) from which the compliance counts, as `contact_lcs` has them for a cone."""
-        forces, smooth = self.forces[:, rough], self.forces[:, ~rough].sum(-1)
+        forces, smooth = self.forces[:, rough], self.forces[:, smooth].sum(-1)
         each = count_forces(1, n_tangents, cone)
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        rays, slid = forces.reshape(len(forces), each * forces.shape[1]), np.zeros_like(self.rows.bound)
+        rays, slid = forces.reshape(len(forces), each * forces.shape[1]), np.zeros(self.rows.bound.shape)
         caps = np.zeros((len(forces), n_caps))  # what has one rests on its rays
         return np.concatenate([rays, caps, smooth, self.row_forces, slid, caps], -1)
 
@@ -78,6 +78,7 @@ class Recovery:
         time: (ngeom,) of recovery [s].
         depth: (ngeom,) for a unit of acceleration [s²].
         creep: (ngeom,) speed of creep for a unit of acceleration [s].
+        largest: (ngeom,) part of a geom in the largest R of its contacts [1/kg].
     """
 
     def __init__(self, model: Any, length: float):
@@ -90,6 +91,7 @@ class Recovery:
         damping = np.where(reference > 0, 0.5 * impedance[1] * time, impedance[1] / np.maximum(-ratio, 1e-9))
         pyramid = 1 + (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)  # about
         self.creep = pyramid * damping * (1 / impedance[0] - 1) / model.opt.impratio
+        self.largest = (1 / impedance[0] - 1).max(initial=0.0) * model.body_invweight0[model.geom_bodyid, 0]
 
 
 class Situation(NamedTuple):
@@ -125,19 +127,16 @@ def evaluate_nominal(at: Situation) -> Nominal:
         ContactWarning: for some states rounding keeps it from finding the forces exactly.
     """
     step, contacts, rows, recovery = at.step, at.contacts, at.rows, at.recovery
-    (n, k, t, nv), r, motion = contacts.tangent.shape, rows.gap.shape[1], step.motion
+    (n, k, t, nv), r = contacts.tangent.shape, rows.gap.shape[1]
     given = contacts._asdict() | {"row_gap": rows.gap, "row_normal": rows.normal, "bend": rows.bend}
-    given |= {name: getattr(rows.soft, name) for name in ("stiffness", "damping", "impedance")}
-    given |= {"row_give": rows.soft.give, "most": rows.soft.bound, "rough": at.rough, "firm": motion.firm}
-    given |= {name: getattr(step, name) for name in ("x", "step", "delayed", "response", "inverse_mass")}
-    given |= {name: getattr(recovery, name) for name in ("time", "depth", "creep")}
-    given |= {"tree": motion.tree.astype(np.int64), "reach": motion.actuators.reach}
-    given = {name: np.ascontiguousarray(v) for name, v in given.items()}
-    given |= {"bounded": rows.n_friction, "steps": motion.steps.count, "seconds": step.seconds, "opens": at.opens}
-    given |= {"give": at.give, "compliance": at.compliance, "least": LEAST, "usual": recovery.usual}
+    given = {name: np.ascontiguousarray(v) for name, v in (given | rows.soft._asdict()).items()}
+    given |= {"row_give": given["give"], "most": given["bound"], "rough": at.rough, "bounded": rows.n_friction}
+    given |= step._asdict() | step.motion.fields | vars(recovery)
+    given |= {"opens": at.opens, "give": at.give, "compliance": at.compliance, "least": LEAST}
     sizes = {"gap": (r,), "normal": (r, nv), "impulse": (r, nv), "bound": (rows.n_friction,), "unit": (r,)}
     sizes |= {"soft": (k,), "opened": (k,), "turned": (k, t, nv), "forces": (k, max(1, 2 * t)), "row_forces": (r,)}
-    found = {name: np.zeros((n, *size)) for name, size in sizes.items()} | {"carried": np.zeros_like(step.delayed)}
+    sizes["carried"] = step.delayed.shape[1:]
+    found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
     if missed := _mujoco.evaluate_nominal(count_threads(n), given, found):
         warn(
             f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} "
@@ -145,6 +144,6 @@ def evaluate_nominal(at: Situation) -> Nominal:
             f"or pass a larger compliance",
             ContactWarning,
         )
-    contacts = contacts._replace(gap=found["opened"], tangent=found["turned"])
-    scaled = ScaledRows(*(found[name] for name in ScaledRows._fields))
+    contacts = MujocoContacts(found["opened"], contacts.normal, found["turned"], contacts.friction, contacts.geom)
+    scaled = ScaledRows(*map(found.__getitem__, ScaledRows._fields))
     return Nominal(contacts, found["soft"], found["forces"], scaled, found["row_forces"], found["carried"])

@@ -36,15 +36,13 @@ class Overlaps(NamedTuple):
     gap: Array
     compliance: Array
 
-    def find_hard(self, rough: NDArray[np.bool_], each: int, n_caps: int) -> NDArray[np.bool_]:
-        """Mask (n, k) of the forces of contacts, `each` of those that are rough: False for those of soft contacts."""
-        others = np.full((len(self.soft), (~rough).sum() + n_caps), True)
-        return np.concatenate([np.repeat(~self.soft[:, rough], each, 1), others], 1)
+    def find_hard(self, rough: Any, each: int, others: int) -> NDArray[np.bool_]:
+        """Mask (n, k) of forces, `each` of rough contacts and then others: False for those of soft contacts."""
+        rays = np.repeat(~self.soft[:, rough], each, 1)
+        return np.concatenate([rays, np.ones((len(rays), others), dtype=bool)], 1)
 
     def evaluate(self, at: Situation) -> Nominal:
         """Evaluate all else at the nominal action, with friction that holds, and add the soft contacts of a step."""
-        if not self.soft.any():
-            return evaluate_nominal(at)
         normal, hard = at.contacts.normal, ~self.soft[:, :, None]
         nominal = evaluate_nominal(at._replace(contacts=at.contacts._replace(normal=normal * hard)))
         gap = np.where(self.soft, self.gap, nominal.contacts.gap)
@@ -53,8 +51,8 @@ class Overlaps(NamedTuple):
         return nominal._replace(contacts=contacts, soft=soft, forces=nominal.forces * hard)
 
 
-def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps:
-    """Find the soft contacts at positions (n, nq), with MuJoCo's parameters.
+def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps | None:
+    """Find the soft contacts at positions (n, nq), with MuJoCo's parameters; None where there are none.
 
     Args:
         model: a model that has contacts and no other constraints.
@@ -65,14 +63,15 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
     Raises:
         InvalidInputError: MuJoCo raised an error.
     """
-    contacts, geoms = at.contacts, np.sort(at.contacts.geom, -1)
-    moves = give_way(contacts.normal, at.step.inverse_mass)
-    ease = (1 / np.clip(model.geom_solimp[:, 0], 1e-4, 0.9999) - 1).max(initial=0.0)
-    most = ease * model.body_invweight0[model.geom_bodyid, 0][geoms].sum(-1)
-    soft = (contacts.gap < 0) & (contacts.friction > 0) & at.rough & (most > _SOFT * moves)
-    firm, force = np.zeros_like(moves), np.zeros_like(moves)
+    contacts = at.contacts
+    soft = (contacts.gap < 0) & (contacts.friction > 0) & at.rough
     if not soft.any():
-        return Overlaps(soft, firm, force)
+        return None
+    moves = give_way(contacts.normal, at.step.inverse_mass)
+    soft &= at.recovery.largest[contacts.geom].sum(-1) > _SOFT * moves
+    if not soft.any():
+        return None
+    geoms, firm, force = np.sort(contacts.geom, -1), np.zeros_like(moves), np.zeros_like(moves)
     for i in np.flatnonzero(soft.any(-1)):
         with native(model, data, f"in state {i} of {len(qpos)}"):
             data.qpos[:] = qpos[i]

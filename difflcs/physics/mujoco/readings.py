@@ -71,14 +71,16 @@ class Readings(NamedTuple):
             sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
             found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
             sure = _mujoco.assemble(count_threads(n), complementarity.DRAG, length, force, given, found)
-            found = dict(zip(found | {"A": 0, "B": 0}, _tensors(*found.values(), free.A, free.B), strict=True))
+            found |= {"A": free.A, "B": free.B}
         else:
             found, sure = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
+            found = {name: v.contiguous().numpy() for name, v in found.items()}
+        found |= {name: self.batched(v) for name, v in found.items() if v.ndim > len(SYSTEM[name])}  # others are shared
+        tensors = dict(zip(found, _tensors(*found.values()), strict=True))
         if not sure:
-            check_finite(found)
-            check_positive_definite(found["F"])
-        own = {name: v for name, v in found.items() if v.ndim > len(SYSTEM[name])}  # others are shared
-        return LCSParams.of_checked(found | {name: self.batched(v) for name, v in own.items()})
+            check_finite(tensors)
+            check_positive_definite(tensors["F"])
+        return LCSParams.of_checked(tensors)
 
     def assemble_in_torch(
         self, contacts: MujocoContacts, rows: ScaledRows, free: FreeMotion, effect: Any, caps: Any, *more: Any

@@ -85,7 +85,7 @@ class MujocoState:
             self._reference[..., q : q + 4] = _unit(self._reference[..., q : q + 4])
 
     def _references(self, batch: tuple[int, ...]) -> Array:
-        """Return the reference of each state (*batch, nq)."""
+        """Return the reference of each state (*batch, nq), or what is broadcast to it."""
         own = self._reference.shape[:-1]
         if batch == own:
             return self._reference
@@ -94,8 +94,7 @@ class MujocoState:
                 f"x: expected states with the first batch dimensions {own} of the reference of their rotations, got "
                 f"{batch}; follow(qpos) with one reference for all, or with those of these states"
             )
-        reference = self._reference.reshape(*own, *[1] * (len(batch) - len(own)), self.nq)
-        return np.broadcast_to(reference, (*batch, self.nq))
+        return self._reference.reshape(*own, *[1] * (len(batch) - len(own)), self.nq)
 
     @property
     def n_x(self) -> int:
@@ -143,7 +142,8 @@ class MujocoState:
         """
         check_tensor("x", x, [("n_x", self.n_x)])
         numbers = to_numpy(x)
-        qpos = self._references(numbers.shape[:-1]).copy()
+        qpos = np.empty((*numbers.shape[:-1], self.nq))
+        qpos[:] = self._references(numbers.shape[:-1])
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
             if not numbers[..., v : v + 3].any():

@@ -57,9 +57,9 @@ class Tries:
         before, self.asked = self.asked, self.asked + len(read.x)
         more = before.bit_length() < self.asked.bit_length()
         due = more or step.motion.actuators.curved.size > 0
-        some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
-        if not some.size:
+        if not (due or read.doubtful.any()):
             return
+        some = np.flatnonzero(read.doubtful | (np.arange(len(read.x)) < _TRIED * due))
         trial = _Trial(self, system, read, step, some)
         size = trial.high - trial.low
         parts = self._parts[: max(_LEAST, _ALL_OVER * more // len(some))]
