@@ -140,7 +140,6 @@ class ContactFinder:
         self._rubs = _may_touch(model) & (self.friction > 0) & (presses and self.axis is None)
         _check_contacts(model, self.allowed, friction)
         self._margin = _margins(model) * self.allowed
-        self._has_margins = self._margin.any()
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
         asked = len(list(pairs)) > 0 if pairs is not None else expected or contacts is not None
         if asked and not len(first):
@@ -163,8 +162,7 @@ class ContactFinder:
         _warn_of_left_out(model, self.allowed, rolling)
         rough = [budget.friction or not self.n_tangents for budget in budgets]
         self.rough = np.repeat(rough, [budget.contacts for budget in budgets])
-        parts = np.flatnonzero(self.rough), np.flatnonzero(~self.rough)
-        self.parts = (np.s_[:], np.s_[:0]) if self.rough.all() else parts  # slices take less time
+        self.parts = (np.s_[:], np.s_[:0]) if self.rough.all() else (self.rough, ~self.rough)  # slices copy nothing
         model.opt.ccd_iterations = _ITERATIONS
         model.opt.disableflags &= ~flags("NATIVECCD")
         model.opt.disableflags |= flags("CONTACT")  # MuJoCo need not find any
@@ -243,7 +241,7 @@ class ContactFinder:
             _mujoco.find_contacts(library(), self._scene, self._places.take(n), qpos, within, *found, near), n
         )
         self._warn_of_more(int(near.max(initial=0)))
-        if self._has_margins:
+        if self._margin.any():
             found.gap[:] -= self._margin[found.geom[..., 0], found.geom[..., 1]]
         return found
 

@@ -135,9 +135,7 @@ def correct(
     if step.turn is not None:
         after = np.concatenate([step.turn_back(after[:, :nv, None].copy())[:, :, 0], after[:, nv:]], 1)
     given = step._asdict() | step.motion.fields | {"forces": acts.shape[1], "lam": lam, "hard": hard}
-    given |= {
-        name: np.ascontiguousarray(v) for name, v in (("after", after), ("bound", bound), ("normal", rows.normal))
-    }
+    given |= {"after": after, "bound": bound, "normal": np.ascontiguousarray(rows.normal)}
     given |= {name: getattr(system, name).numpy() for name in "ABCd"}
     _mujoco.correct(count_threads(n), STILL, given, doubtful)
     return doubtful

@@ -25,7 +25,7 @@ from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, scale, soften
 from difflcs.physics.mujoco.motion import Dynamic
 from difflcs.physics.mujoco.native import flags, in_turn, native, take_given, taken, to_numpy
-from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation, evaluate_nominal
+from difflcs.physics.mujoco.nominal import LEAST, Recovery, Situation
 from difflcs.physics.mujoco.overlap import find_overlaps
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.quasi_static import QuasiStatic
@@ -168,7 +168,7 @@ class MujocoLCS:
         self._touching.opt.disableflags &= ~flags("CONTACT")
         with native(model, self._data, "in the state of data"):
             self._give, self._yields = _respond(self, limits != 0)
-        self._corrects = self._whole is not None and self.n_lam > 0
+        self._corrects = self._whole if self.n_lam else None
         self._tries = self._whole and Tries(self._whole, self._places, relative, self._yields)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -235,7 +235,7 @@ class MujocoLCS:
             more = self._recovery, self._give, self.compliance, self.cone == "anitescu"
             at = Situation(step, contacts, self._finder.rough, found, *more)
             overlaps = find_overlaps(self._touching, self._data, read.qpos, at)
-            nominal = overlaps.evaluate(at) if overlaps is not None else evaluate_nominal(at)
+            nominal = overlaps.evaluate(at)
             contacts, soft, rows = nominal.contacts, nominal.soft, nominal.rows
             rest = nominal.rest(rough, smooth, self._finder.n_tangents, self.cone, self._caps.count)
             loads, response = nominal.forces[:, rough].sum(-1) if self._caps.count else None, step.response
@@ -256,13 +256,10 @@ class MujocoLCS:
         if self.motion == "quasi-dynamic":
             _rest_on_forces(self, system, read, response)
         system = self._servos.limit(system, free, step, read, self.length, self._give)
-        if step is not None and read.after is not None:
-            sizes = count_forces(1, self._finder.n_tangents, self.cone), n_smooth + self._caps.count
-            if overlaps is None:
-                hard = np.ones((1, sizes[0] * contacts.gap.shape[1] + sizes[1]), dtype=bool)
-            else:
-                hard = overlaps.find_hard(rough, *sizes)
-            read.doubtful[:] = correct(system, step, read.after, rows.bound / unit, found, hard, rest != 0)
+        if step is not None and overlaps is not None and read.after is not None:
+            each, others = count_forces(1, self._finder.n_tangents, self.cone), n_smooth + self._caps.count
+            more = rows.bound / unit, found, overlaps.find_hard(rough, each, others), rest != 0
+            read.doubtful[:] = correct(system, step, read.after, *more)
         if step is not None and self._tries is not None:
             self._tries.warn(system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -329,8 +326,8 @@ class MujocoLCS:
         moved, after = self._motion.read(self._places, states, ctrl), None
         if isinstance(self._motion, Dynamic):
             moved = self._motion.find_secants(moved, self._places, states, flat)
-            if self._whole is not None and self._corrects:
-                after = self._whole.hold(moved, self._places, states, flat)
+            if self._corrects is not None:
+                after = self._corrects.hold(moved, self._places, states, flat)
         return Readings(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool), after)
 
 

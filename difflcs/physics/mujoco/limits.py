@@ -56,10 +56,6 @@ class Softness(NamedTuple):
         rate = self.damping * mass / np.maximum(mass + firm, 1e-300)
         return firm / self.damping * -np.expm1(-rate * seconds)
 
-    def at(self, index: Any) -> Softness:
-        """Return those of some rows."""
-        return Softness(*(values[index] for values in self))
-
 
 class Rows(NamedTuple):
     """Rows of n states, k − n_friction of limits and then those of dry friction.
@@ -172,7 +168,7 @@ class RowFinder:
             none = np.zeros((n, 0))
             return Rows(none, np.zeros((n, 0, nv)), none, self._soft, 0)
         normal, gap, bend, tendons = self._limits(qpos, place, middle)
-        soft, where = self._soft, np.arange(n)[:, None]
+        soft = self._soft
         if self.n_limits < gap.shape[1]:
             gives = give_way(normal, response)
             after = np.minimum(gap, gap + (normal @ place[:, :, None])[:, :, 0])
@@ -180,9 +176,10 @@ class RowFinder:
             # What does not give way cannot act.
             after = np.where(gives > 0, after / np.sqrt(np.maximum(gives, 1e-300)), np.inf)
             chosen = np.sort(np.argpartition(after, self.n_limits, -1)[:, : self.n_limits])
-            normal, gap, bend = normal[where, chosen], gap[where, chosen], bend[where, chosen]
+            normal, gap, bend = (values[np.arange(n)[:, None], chosen] for values in (normal, gap, bend))
             of_friction = np.arange(len(self._range), len(self._soft.bound))
-            soft = soft.at(np.concatenate([chosen, np.tile(of_friction, (n, 1))], 1))
+            rows = np.concatenate([chosen, np.tile(of_friction, (n, 1))], 1)
+            soft = Softness(*(values[rows] for values in soft))
         if self.n_friction:
             rubbing = np.repeat(self._rubs[None], n, 0)
             normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
@@ -196,10 +193,8 @@ class RowFinder:
         """
         model, n = self.model, len(place)
         k, balls = len(self._joints), len(self._balls)
-        value, along = np.zeros((n, len(self._range))), self._along
+        value, along = np.zeros((n, len(self._range))), np.repeat(self._along[None], n, 0)
         value[:, :k] = qpos[:, self._addresses]
-        if k < len(along):
-            along = np.repeat(along[None], n, 0)
         for row, joint in enumerate(self._balls, k):
             address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
             quaternion = qpos[:, address : address + 4]
@@ -208,8 +203,7 @@ class RowFinder:
             value[:, row] = 2 * np.arctan2(sine, quaternion[:, 0])
             along[:, row, dof : dof + 3] = quaternion[:, 1:] / np.maximum(sine, 1e-12)[:, None]
         length, tendons = self._read_tendons(qpos)
-        if len(self._tendons):
-            value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
+        value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
         lower, upper = value - self._range[:, 0], self._range[:, 1] - value
         moved = (along @ place[:, :, None])[:, :, 0]
         side = np.where(lower + moved < upper - moved, 1.0, -1.0)

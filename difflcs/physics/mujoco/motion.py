@@ -82,22 +82,14 @@ class Dynamic:
         kinds = self.steps, self.simulated, self.finer
         steps = [(k, _WAYS.get(way, 1), actuators.durations(seconds / k).tolist()) for k, way in kinds]
         self._dynamics = _mujoco.Dynamics(fields | {"steps": steps})
-        self.tree = np.array(model.dof_treeid)  # degrees of freedom of different trees meet by contacts alone
-        self.trees, self.of_tree = np.unique(self.tree, return_inverse=True)
-        self.in_tree = self.tree[:, None] == self.trees  # (nv, n_trees)
+        tree = model.dof_treeid.astype(np.int64)  # degrees of freedom of different trees meet by contacts alone
+        trees, of_tree = np.unique(tree, return_inverse=True)
+        self.in_tree = tree[:, None] == trees  # (nv, n_trees)
         firm = np.isin(  # those of trees with an actuator at every joint
-            self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
+            tree, np.setdiff1d(tree, tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
-        self.fields = {
-            "tree": self.tree.astype(np.int64),
-            "of_tree": self.of_tree,
-            "trees": len(self.trees),
-            "firm": firm,
-            "presses": bool(firm.any()),
-            "reach": actuators.reach,
-            "steps": count,
-            "seconds": seconds,
-        }
+        self.fields: dict[str, Any] = {"tree": tree, "of_tree": of_tree, "trees": len(trees), "seconds": seconds}
+        self.fields |= {"firm": firm, "presses": bool(firm.any()), "reach": actuators.reach, "steps": count}
         self._hinges = model.nv + np.flatnonzero(model.jnt_type[model.dof_jntid] == _HINGE)
         self._bends = np.isin(np.arange(model.nu), actuators.curved)
         self.flags = flags("CONTACT", "LIMIT", "FRICTIONLOSS") if model.neq else flags("CONSTRAINT")
@@ -118,8 +110,7 @@ class Dynamic:
             InvalidInputError: MuJoCo raised an error, or has counted a warning.
         """
         read = self.read_by(self._native(self.simulated), places, states, ctrl)
-        if read.unstable.any():
-            unstable = read.unstable.copy()
+        if (unstable := read.unstable.copy()).any():
             again = self.read_by(self._native(self.finer), places, states[unstable], ctrl[unstable])
             for values, better in zip(read, again, strict=True):
                 values[unstable] = better
@@ -147,9 +138,9 @@ class Dynamic:
         secants = np.repeat(np.where(ends.any(0), 0.0, np.inf)[:, None], x.shape[1], 1)
         weights = ends / np.maximum((ends**2).sum(0), 1e-300)
         for kind in (bends, ~bends):
-            if not kind.any() or not (those := np.nonzero(ends * kind))[0].size:
+            _, state, i = those = np.nonzero(ends * kind)
+            if not i.size:
                 continue
-            _, state, i = those
             other = ctrl[state]
             other[np.arange(len(i)), i] += ends[those]
             taken, steps = (places, states[state], other), self._native(self.simulated)

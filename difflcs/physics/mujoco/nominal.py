@@ -135,8 +135,7 @@ def evaluate_nominal(at: Situation) -> Nominal:
     given |= {"opens": at.opens, "give": at.give, "compliance": at.compliance, "least": LEAST}
     sizes = {"gap": (r,), "normal": (r, nv), "impulse": (r, nv), "bound": (rows.n_friction,), "unit": (r,)}
     sizes |= {"soft": (k,), "opened": (k,), "turned": (k, t, nv), "forces": (k, max(1, 2 * t)), "row_forces": (r,)}
-    sizes["carried"] = step.delayed.shape[1:]
-    found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
+    found = {name: np.zeros((n, *size)) for name, size in sizes.items()} | {"carried": np.zeros(step.delayed.shape)}
     if missed := _mujoco.evaluate_nominal(count_threads(n), given, found):
         warn(
             f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} "

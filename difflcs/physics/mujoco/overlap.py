@@ -27,7 +27,7 @@ class Overlaps(NamedTuple):
     """Soft contacts of n states.
 
     Attributes:
-        soft: (n, n_contacts) True for those that are soft.
+        soft: (n, n_contacts) True for those that are soft; all have one row where there are none.
         gap: (n, n_contacts) from which the rays of soft contacts count [m].
         compliance: (n, n_contacts) of soft contacts, in parts of how far they give way.
     """
@@ -43,6 +43,8 @@ class Overlaps(NamedTuple):
 
     def evaluate(self, at: Situation) -> Nominal:
         """Evaluate all else at the nominal action, with friction that holds, and add the soft contacts of a step."""
+        if not self.soft.any():
+            return evaluate_nominal(at)
         normal, hard = at.contacts.normal, ~self.soft[:, :, None]
         nominal = evaluate_nominal(at._replace(contacts=at.contacts._replace(normal=normal * hard)))
         gap = np.where(self.soft, self.gap, nominal.contacts.gap)
@@ -51,8 +53,8 @@ class Overlaps(NamedTuple):
         return nominal._replace(contacts=contacts, soft=soft, forces=nominal.forces * hard)
 
 
-def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps | None:
-    """Find the soft contacts at positions (n, nq), with MuJoCo's parameters; None where there are none.
+def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps:
+    """Find the soft contacts at positions (n, nq), with MuJoCo's parameters.
 
     Args:
         model: a model that has contacts and no other constraints.
@@ -63,14 +65,13 @@ def find_overlaps(model: Any, data: Any, qpos: Array, at: Situation) -> Overlaps
     Raises:
         InvalidInputError: MuJoCo raised an error.
     """
-    contacts = at.contacts
+    contacts, none = at.contacts, np.zeros((1, len(at.rough)))
     soft = (contacts.gap < 0) & (contacts.friction > 0) & at.rough
+    if soft.any():
+        moves = give_way(contacts.normal, at.step.inverse_mass)
+        soft &= at.recovery.largest[contacts.geom].sum(-1) > _SOFT * moves
     if not soft.any():
-        return None
-    moves = give_way(contacts.normal, at.step.inverse_mass)
-    soft &= at.recovery.largest[contacts.geom].sum(-1) > _SOFT * moves
-    if not soft.any():
-        return None
+        return Overlaps(none > 0, none, none)
     geoms, firm, force = np.sort(contacts.geom, -1), np.zeros_like(moves), np.zeros_like(moves)
     for i in np.flatnonzero(soft.any(-1)):
         with native(model, data, f"in state {i} of {len(qpos)}"):

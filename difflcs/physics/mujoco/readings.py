@@ -69,9 +69,8 @@ class Readings(NamedTuple):
             (n, n_x), n_u, n_bounded = self.x.shape, free.B.shape[-1], rows.bound.shape[1] + caps.shape[1]
             m = complementarity.count_forces(contacts.tangent.shape[1], contacts.tangent.shape[2], cone, k, n_bounded)
             sizes = {"C": (n_x, m), "d": (n_x,), "D": (m, n_x), "E": (m, n_u), "F": (m, m), "c": (m,)}
-            found = {name: np.zeros((n, *size)) for name, size in sizes.items()}
+            found: Any = {name: np.zeros((n, *size)) for name, size in sizes.items()} | {"A": free.A, "B": free.B}
             sure = _mujoco.assemble(count_threads(n), complementarity.DRAG, length, force, given, found)
-            found |= {"A": free.A, "B": free.B}
         else:
             found, sure = self.assemble_in_torch(contacts, rows, free, effect, caps, *more), False
             found = {name: v.contiguous().numpy() for name, v in found.items()}
