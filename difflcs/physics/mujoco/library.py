@@ -133,7 +133,7 @@ class Places:
 
 def count_threads(n: int) -> int:
     """Count the threads for n states."""
-    return max(1, min(n, torch.get_num_threads()))
+    return min(n, torch.get_num_threads()) if n > 1 else 1
 
 
 def _address(name: str, field: np.ndarray, kind: type = np.float64) -> int:

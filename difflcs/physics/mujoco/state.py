@@ -149,9 +149,7 @@ class MujocoState:
             if not numbers[..., v : v + 3].any():
                 continue  # nothing has turned
             qpos[..., q : q + 4] = _multiply(qpos[..., q : q + 4], _quaternion(numbers[..., v : v + 3]))
-        velocity = np.zeros((*numbers.shape[:-1], self.nv))
-        if self.velocities:
-            velocity = numbers[..., self.nv : 2 * self.nv]
+        velocity = numbers[..., self.nv : 2 * self.nv] if self.velocities else np.zeros((*qpos.shape[:-1], self.nv))
         return qpos, velocity
 
     def flatten(self, x: Tensor, act: Array) -> Array:
