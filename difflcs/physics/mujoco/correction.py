@@ -99,25 +99,29 @@ class WholeStep:
         return torch.stack(found, -2)
 
 
-def find_forces(system: LCSParams, x: Array, u: Array, acts: NDArray[np.bool_] | None = None) -> Array:
+def to_arrays(system: LCSParams) -> dict[str, Array]:
+    """Return the numbers of systems, of which those of `LCSParams` that are contiguous are no copies."""
+    return {name: v.contiguous().numpy() for name, v in system.tensors().items()}
+
+
+def find_forces(system: dict[str, Array], x: Array, u: Array, acts: NDArray[np.bool_] | None = None) -> Array:
     """Find the forces (..., n_lam) of systems by the active sets; the first are likely those that `acts` (n, k)."""
-    n, m = math.prod(x.shape[:-1]), system.n_lam
+    n, m = math.prod(x.shape[:-1]), system["c"].shape[-1]
     lam, found = np.zeros((n, m)), np.zeros(n, dtype=bool)
     if not lam.size:
         return lam.reshape(*x.shape[:-1], m)
     if acts is not None:
         lam[:, : acts.shape[-1]] = acts
-    given = {name: v.contiguous().numpy() for name, v in system.tensors().items() if name in "DEFc"}
     at, by = (np.ascontiguousarray(v.reshape(n, v.shape[-1])) for v in (x, u))
-    _mujoco.solve_forces(0.0, count_threads(n), given, at, by, np.zeros(m), np.full(m, np.inf), lam, found)
+    _mujoco.solve_forces(0.0, count_threads(n), system, at, by, np.zeros(m), np.full(m, np.inf), lam, found)
     if (more := np.flatnonzero(~found)).size:
-        F = given["F"].reshape(-1, m, m)[more % (given["F"].size // m**2)]
+        F = system["F"].reshape(-1, m, m)[more % (system["F"].size // m**2)]
         lam[more] = solve_lcp(torch.from_numpy(F), torch.from_numpy(lam[more])).lam.numpy()
     return lam.reshape(*x.shape[:-1], m)
 
 
 def correct(
-    system: LCSParams, step: DynamicStep, after: Array, bound: Array, rows: Rows, hard: Any, acts: Any
+    system: dict[str, Array], step: DynamicStep, after: Array, bound: Array, rows: Rows, hard: Any, acts: Any
 ) -> NDArray[np.bool_]:
     """Correct C and d of systems at n states in place; return those (n,) where more is corrected than moves.
 
@@ -134,8 +138,7 @@ def correct(
     lam, doubtful = find_forces(system, step.x, step.idle, acts), np.zeros(n, dtype=bool)
     if step.turn is not None:
         after = np.concatenate([step.turn_back(after[:, :nv, None].copy())[:, :, 0], after[:, nv:]], 1)
-    given = step._asdict() | step.motion.fields | {"forces": acts.shape[1], "lam": lam, "hard": hard}
+    given = step._asdict() | step.motion.fields | system | {"forces": acts.shape[1], "lam": lam, "hard": hard}
     given |= {"after": after, "bound": bound, "normal": np.ascontiguousarray(rows.normal)}
-    given |= {name: getattr(system, name).numpy() for name in "ABCd"}
     _mujoco.correct(count_threads(n), STILL, given, doubtful)
     return doubtful

@@ -18,7 +18,7 @@ from difflcs.physics.complementarity import Cone, Contacts, count_forces, given_
 from difflcs.physics.mujoco.actuators import Actuators, check_model
 from difflcs.physics.mujoco.caps import Caps
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs, median_apart, typical_radius
-from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces
+from difflcs.physics.mujoco.correction import WholeStep, correct, find_forces, to_arrays
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import Groups, find_budgets
 from difflcs.physics.mujoco.library import Places
@@ -259,7 +259,7 @@ class MujocoLCS:
         if step is not None and overlaps is not None and read.after is not None:
             each, others = count_forces(1, self._finder.n_tangents, self.cone), n_smooth + self._caps.count
             more = rows.bound / unit, found, overlaps.find_hard(rough, each, others), rest != 0
-            read.doubtful[:] = correct(system, step, read.after, *more)
+            read.doubtful[:] = correct(to_arrays(system), step, read.after, *more)
         if step is not None and self._tries is not None:
             self._tries.warn(system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
@@ -349,11 +349,12 @@ def _rest_on_forces(of: MujocoLCS, system: LCSParams, read: Readings, response: 
     """Let contacts give way from their forces at the nominal action on, and set the caps of friction by these."""
     rough, smooth = int(of._finder.rough.sum()), int((~of._finder.rough).sum()) + of._caps.count
     count = count_forces(rough, of._finder.n_tangents, of.cone, smooth)
-    firm, c = np.einsum("...ii->...i", system.F.numpy())[..., :count], system.c.numpy()
+    arrays = to_arrays(system)
+    firm, c = np.einsum("...ii->...i", arrays["F"])[..., :count], arrays["c"]
     least = min(LEAST, 0.5 * of.compliance) * (firm - of.compliance)
     more = np.maximum(least - of.compliance, 0.0)
     if len(read.x) and (of._caps.count or more.any()):
-        lam = find_forces(system, read.batched(read.x), read.batched(read.moved.nominal))
+        lam = find_forces(arrays, read.batched(read.x), read.batched(read.moved.nominal))
         firm += more
         c[..., :count] -= more * lam[..., :count]
         of._caps.limit_by_forces(c, lam, read, response)

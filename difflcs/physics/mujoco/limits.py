@@ -167,8 +167,7 @@ class RowFinder:
         if not (self.n_limits or self.n_friction):
             none = np.zeros((n, 0))
             return Rows(none, np.zeros((n, 0, nv)), none, self._soft, 0)
-        normal, gap, bend, tendons = self._limits(qpos, place, middle)
-        soft = self._soft
+        (normal, gap, bend, tendons), soft = self._limits(qpos, place, middle), self._soft
         if self.n_limits < gap.shape[1]:
             gives = give_way(normal, response)
             after = np.minimum(gap, gap + (normal @ place[:, :, None])[:, :, 0])
@@ -177,8 +176,7 @@ class RowFinder:
             after = np.where(gives > 0, after / np.sqrt(np.maximum(gives, 1e-300)), np.inf)
             chosen = np.sort(np.argpartition(after, self.n_limits, -1)[:, : self.n_limits])
             normal, gap, bend = (values[np.arange(n)[:, None], chosen] for values in (normal, gap, bend))
-            of_friction = np.arange(len(self._range), len(self._soft.bound))
-            rows = np.concatenate([chosen, np.tile(of_friction, (n, 1))], 1)
+            rows = np.concatenate([chosen, np.tile(np.arange(len(self._range), len(soft.bound)), (n, 1))], 1)
             soft = Softness(*(values[rows] for values in soft))
         if self.n_friction:
             rubbing = np.repeat(self._rubs[None], n, 0)

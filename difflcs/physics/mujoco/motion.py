@@ -85,9 +85,7 @@ class Dynamic:
         tree = model.dof_treeid.astype(np.int64)  # degrees of freedom of different trees meet by contacts alone
         trees, of_tree = np.unique(tree, return_inverse=True)
         self.in_tree = tree[:, None] == trees  # (nv, n_trees)
-        firm = np.isin(  # those of trees with an actuator at every joint
-            tree, np.setdiff1d(tree, tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
-        )
+        firm = ~np.isin(tree, tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])  # trees with drives everywhere
         self.fields: dict[str, Any] = {"tree": tree, "of_tree": of_tree, "trees": len(trees), "seconds": seconds}
         self.fields |= {"firm": firm, "presses": bool(firm.any()), "reach": actuators.reach, "steps": count}
         self._hinges = model.nv + np.flatnonzero(model.jnt_type[model.dof_jntid] == _HINGE)

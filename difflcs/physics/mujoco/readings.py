@@ -44,7 +44,7 @@ class Readings(NamedTuple):
 
     def batched(self, value: Any) -> Any:
         """Give an array (n, ...) the batch dimensions."""
-        return value.reshape(*self.batch, *value.shape[1:])
+        return value if len(self.batch) == 1 else value.reshape(*self.batch, *value.shape[1:])
 
     def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
         """Convert derivatives by the degrees of freedom to derivatives by the state; all are tensors."""

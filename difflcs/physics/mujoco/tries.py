@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from difflcs.errors import ContactWarning, warn
-from difflcs.physics.mujoco.correction import STILL, WholeStep, find_forces
+from difflcs.physics.mujoco.correction import STILL, WholeStep, find_forces, to_arrays
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.readings import Readings
@@ -73,8 +73,8 @@ class _Trial:
     """Systems at n states of all that were read, those of `some` numbers, with the range (n, nu) of their actions."""
 
     def __init__(self, tries: Tries, system: LCSParams, read: Readings, step: DynamicStep, some: Any):
-        flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-        self.system, self.x, self._states = LCSParams.of_checked(flat), read.x[some], read.states[some]
+        arrays = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in to_arrays(system).items()}
+        self.system, self.x, self._states = arrays, read.x[some], read.states[some]
         self._tries, self._motion, self._unstable = tries, step.motion, read.moved.unstable[some]
         self._velocity, self._mass = step.velocity[some], np.linalg.inv(read.moved.inverse_mass[some])
         self._still = np.sqrt(np.diagonal(self._mass, axis1=1, axis2=2) @ step.motion.in_tree)
@@ -104,7 +104,7 @@ class _Trial:
         """
         np.clip(u, self.low, self.high, out=u)
         (m, n, _), nv = u.shape, self._velocity.shape[1]
-        A, B, C, d = (v.numpy()[:, nv : 2 * nv] for v in (self.system.A, self.system.B, self.system.C, self.system.d))
+        A, B, C, d = (self.system[name][:, nv : 2 * nv] for name in "ABCd")
         x = np.broadcast_to(self.x, (m, *self.x.shape))
         forces = (C @ find_forces(self.system, x, u)[..., None])[..., 0]
         predicted = ((A @ x[..., None]) + B @ u[..., None])[..., 0] + d + forces
