@@ -32,48 +32,46 @@ struct Matrices {
 // Writes the matrices of a state, zero before; false where only their numbers say whether they are finite, F + Fᵀ ≻ 0.
 DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
   const int nv = s.nv, nx = s.nx, rays = s.contacts * s.each(), m = s.rows(), all = s.forces(), first = m - s.bounded;
-  std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), along(nv), effect(nx), transposed(nv * nx);
+  std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), left(std::max(nx, m) * nv), right(nv * all);
   const auto put = [&](int i, const double* row, bool counts, double apart, double compliance) {
-    double* to = &rows[i * nv];
-    g.turn == nullptr ? static_cast<void>(std::copy_n(row, nv, to)) : multiply(row, g.turn, nv, nv, to);
-    if (counts) std::copy_n(to, nv, &counted[i * nv]);
+    std::copy_n(row, nv, &rows[i * nv]);
+    if (counts) std::copy_n(row, nv, &counted[i * nv]);
     gap[i] = apart;
     soft[i] = compliance;
   };
   for (int k = 0; k < s.contacts; k++) {
     for (int r = 0; r < s.each(); r++) {
       const int i = k * s.each() + r;
-      if (s.tangents > 0) put(i, g.tangent + (k * s.tangents + r / 2) * nv, false, 0.0, 0.0);
-      std::copy_n(&rows[i * nv], nv, along.data());
       put(i, g.normal + k * nv, true, g.gap[k], g.soft[k]);
-      if (s.tangents > 0) add(r % 2 == 0 ? g.friction[k] : -g.friction[k], along.data(), nv, &rows[i * nv]);
+      const double friction = r % 2 == 0 ? g.friction[k] : -g.friction[k];
+      if (s.tangents > 0) add(friction, g.tangent + (k * s.tangents + r / 2) * nv, nv, &rows[i * nv]);
     }
     if (k < s.caps) put(rays + k, g.normal + k * nv, true, g.gap[k], g.soft[k]);
   }
   for (int k = 0, i = rays + s.caps; k < s.others; k++, i++)
     put(i, g.other_normal + k * nv, i < first, g.other_gap[k], g.soft[s.contacts + k]);
-  for (int v = 0; v < nx; v++)
-    for (int w = 0; w < nv; w++) transposed[w * nx + v] = g.response[v * nx + w];
-  for (int i = 0; i < m; i++) {
-    const int k = i - rays - s.caps;
-    if (k < 0 || g.effect == nullptr) {
-      multiply(&rows[i * nv], transposed.data(), nv, nx, effect.data());
-    } else {
-      for (int v = 0; v < nx; v++) effect[v] = g.effect[v * s.others + k];
-    }
-    for (int v = 0; v < nx; v++) into.C[v * all + i] = effect[v] * s.force;
+  for (auto* of_rows : {&rows, &counted}) {
+    if (g.turn == nullptr) break;
+    multiply(of_rows->data(), g.turn, m, nv, nv, left.data());
+    std::copy_n(left.data(), m * nv, of_rows->data());
   }
+  for (int v = 0; v < nx; v++) std::copy_n(g.response + v * nx, nv, &left[v * nv]);
+  for (int i = 0; i < m; i++)
+    for (int v = 0; v < nv; v++) right[v * all + i] = rows[i * nv + v] * s.force;
+  multiply(left.data(), right.data(), nx, nv, all, into.C);
+  for (int v = 0; v < nx && g.effect != nullptr; v++)
+    for (int k = 0; k < s.others; k++) into.C[v * all + rays + s.caps + k] = g.effect[v * s.others + k] * s.force;
+  for (int i = 0; i < m * nv; i++) left[i] = rows[i] / s.length;
+  multiply(left.data(), into.C, m, nv, all, into.F);
+  multiply(left.data(), g.A, m, nv, nx, into.D);
+  multiply(left.data(), g.B, m, nv, s.nu, into.E);
   double size = 0, largest = 0, softest = INFINITY;
   for (int i = 0; i < m; i++) {
-    const double* row = &rows[i * nv];
-    for (int v = 0; v < nv; v++) along[v] = row[v] / s.length;
-    multiply(along.data(), into.C, nv, all, into.F + i * all);
-    multiply(along.data(), g.A, nv, nx, into.D + i * nx);
-    multiply(along.data(), g.B, nv, s.nu, into.E + i * s.nu);
+    const double *row = &rows[i * nv], *along = &left[i * nv];
     for (int v = 0; v < nv; v++) into.D[i * nx + v] -= (row[v] - counted[i * nv + v]) / s.length;
-    into.c[i] = gap[i] / s.length + dot(along.data(), g.d, nv) - dot(&counted[i * nv], g.x, nv) / s.length;
+    into.c[i] = gap[i] / s.length + dot(along, g.d, nv) - dot(&counted[i * nv], g.x, nv) / s.length;
     if (g.rest != nullptr) into.c[i] -= soft[i] * g.rest[i] / s.force;
-    size += dot(along.data(), row, nv);
+    size += dot(along, row, nv);
     softest = std::min(softest, soft[i]);
   }
   for (int i = 0; i < m; i++) {

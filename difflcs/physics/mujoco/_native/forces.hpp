@@ -11,6 +11,7 @@
 // Of a function with all that it calls there is one for each instruction set, chosen when the library is loaded.
 #if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
 #define DIFFLCS_CLONES __attribute__((target_clones("avx512f", "avx2", "default"), flatten))
+#define DIFFLCS_VERSIONS
 #else
 #define DIFFLCS_CLONES
 #endif
@@ -34,8 +35,9 @@ inline double dot(const double* a, const double* b, int n) {
   for (; k + 8 <= n; k += 8)
     for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
   for (; k < n; k++) sum += a[k] * b[k];
-  for (const double one : sums) sum += one;
-  return sum;
+  if (n < 8) return sum;
+  for (int l = 0; l < 4; l++) sums[l] += sums[l + 4];
+  return sum + (sums[0] + sums[2]) + (sums[1] + sums[3]);
 }
 
 // into += factor · row: what a compiler can do side by side.
@@ -43,20 +45,59 @@ inline void add(double factor, const double* row, int n, double* __restrict into
   for (int k = 0; k < n; k++) into[k] += factor * row[k];
 }
 
-// into (m) += four numbers times four rows (4, m).
-inline void add_four(const double* by, const double* rows, int m, double* __restrict into) {
-  const double a = by[0], b = by[1], c = by[2], d = by[3];
-  for (int k = 0; k < m; k++) into[k] += a * rows[k] + b * rows[m + k] + c * rows[2 * m + k] + d * rows[3 * m + k];
+// So many columns of a row times a matrix (·, m), by `kSide` side by side; `at`: which numbers of the row count.
+template <int kSide, int kTimes, class At>
+void multiply_columns(const double* row, const double* matrix, int m, double* into, int count, At at) {
+  typedef double Side __attribute__((vector_size(8 * kSide), aligned(8), may_alias));
+  Side sums[kTimes]{};
+  for (int c = 0; c < count; c++) {
+    const int v = at(c);
+    for (int k = 0; k < kTimes; k++) sums[k] += row[v] * *reinterpret_cast<const Side*>(matrix + v * m + kSide * k);
+  }
+  for (int k = 0; k < kTimes; k++) *reinterpret_cast<Side*>(into + kSide * k) = sums[k];
 }
 
-// into (m) = row (n) times a matrix (n, m). A row of contacts is mostly zeros.
-inline void multiply(const double* row, const double* matrix, int n, int m, double* into) {
-  std::fill_n(into, m, 0.0);
-  int v = 0;
-  for (; v + 4 <= n; v += 4)
-    if (!is_zero(row + v, 4)) add_four(row + v, matrix + v * m, m, into);
-  for (; v < n; v++)
-    if (row[v] != 0) add(row[v], matrix + v * m, m, into);
+template <int kSide, class At>
+void multiply_row(const double* row, const double* matrix, int m, double* into, int count, At at) {
+  int k = 0;
+  for (; k + 4 * kSide <= m; k += 4 * kSide) multiply_columns<kSide, 4>(row, matrix + k, m, into + k, count, at);
+  for (; k + 2 * kSide <= m; k += 2 * kSide) multiply_columns<kSide, 2>(row, matrix + k, m, into + k, count, at);
+  for (; k < m && m >= kSide; k += kSide) {  // at last some that are there already
+    k = std::min(k, m - kSide);
+    multiply_columns<kSide, 1>(row, matrix + k, m, into + k, count, at);
+  }
+  for (; k < m; k++) multiply_columns<1, 1>(row, matrix + k, m, into + k, count, at);
+}
+
+// into (rows, m) = a (rows, n) times a matrix (n, m). A row of contacts is mostly zeros.
+template <int kSide>
+void multiply_by(const double* a, const double* matrix, int rows, int n, int m, double* into) {
+  constexpr int kFew = 16, kMany = 256;  // numbers of a row between which those that are not zero are listed
+  int some[kMany];
+  for (int i = 0; i < rows; i++, a += n, into += m) {
+    int count = n;
+    if (n >= kFew && n <= kMany) count = n - static_cast<int>(std::count(a, a + n, 0.0));
+    if (2 * count > n) {
+      multiply_row<kSide>(a, matrix, m, into, n, [](int c) { return c; });
+      continue;
+    }
+    for (int v = 0, c = 0; c < count; v++) {
+      some[c] = v;
+      c += a[v] != 0;
+    }
+    multiply_row<kSide>(a, matrix, m, into, count, [&](int c) { return some[c]; });
+  }
+}
+
+#ifdef DIFFLCS_VERSIONS
+__attribute__((target("avx2"), flatten)) static void multiply(const double* a, const double* matrix, int rows, int n, int m,
+                                                             double* into) {
+  multiply_by<4>(a, matrix, rows, n, m, into);
+}
+__attribute__((target("default"), flatten))
+#endif
+static void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into) {
+  multiply_by<2>(a, matrix, rows, n, m, into);
 }
 
 // Overwrites b (n, m) by M⁻¹ b and M (n, n) by its factors, with row exchanges; false where M is singular.
@@ -100,8 +141,9 @@ class ActiveSet {
     y_.resize(n);
     dy_.resize(n);
     mu_.assign(lam, lam + n);
+    if (c > 0) gaps(F, q, lam, true, n);
     for (int i = 0; i < n; i++) {
-      y_[i] = q[i] + dot(F + i * n, lam, n) - c * lam[i];
+      if (c > 0) y_[i] = w_[i] - c * lam[i];
       side_[i] = c > 0 ? side(y_[i], c, low[i], high[i]) : (lam[i] >= high[i]) - (lam[i] <= low[i]);
     }
     int fewest = n + 1, patience = kPatience;
@@ -110,9 +152,9 @@ class ActiveSet {
       if (!solve_dense(M_.data(), static_cast<int>(part_.size()), part_.data(), 1)) return false;
       for (size_t i = 0; i < part_.size(); i++) lam[within_[i]] = part_[i];
       wrong_.clear();
+      gaps(F, q, lam, c > 0, n);
       for (int i = 0; i < n; i++) {
-        const double* row = F + i * n;
-        const double w = side_[i] == 0 ? 0.0 : q[i] + dot(row, lam, n);
+        const double *row = F + i * n, w = side_[i] == 0 ? 0.0 : w_[i];
         const double off = side_[i] == 0 ? std::max(low[i] - lam[i], lam[i] - high[i]) * row[i] : side_[i] * w;
         if (!(off <= 0) && !(off <= kSlight * (std::fabs(q[i]) + terms(row, lam, n)))) wrong_.push_back(i);
         dy_[i] = w - c * lam[i] - y_[i];
@@ -140,6 +182,15 @@ class ActiveSet {
   }
 
  private:
+  // Write q + F λ; of a symmetric F by its columns, as λ is mostly zeros.
+  void gaps(const double* F, const double* q, const double* lam, bool symmetric, int n) {
+    w_.assign(q, q + n);
+    for (int i = 0; i < n; i++) {
+      if (!symmetric) w_[i] += dot(F + i * n, lam, n);
+      else if (lam[i] != 0) add(lam[i], F + i * n, n, w_.data());
+    }
+  }
+
   static double terms(const double* row, const double* lam, int n) {
     double sum = 0;
     for (int k = 0; k < n; k++) sum += std::fabs(row[k] * lam[k]);
@@ -174,16 +225,18 @@ class ActiveSet {
       lam[i] = side_[i] == 0 ? 0.0 : side_[i] > 0 ? high[i] : low[i];
       if (side_[i] == 0) within_.push_back(i);
     }
-    M_.clear();
+    const bool zero = is_zero(lam, n);
+    M_.resize(within_.size() * within_.size());
     part_.clear();
+    double* into = M_.data();
     for (const int i : within_) {
-      for (const int j : within_) M_.push_back(F[i * n + j]);
-      part_.push_back(-q[i] - dot(F + i * n, lam, n));
+      for (const int j : within_) *into++ = F[i * n + j];
+      part_.push_back(-q[i] - (zero ? 0.0 : dot(F + i * n, lam, n)));
     }
   }
 
   std::vector<int> side_, within_, wrong_;
-  std::vector<double> M_, part_, y_, dy_, mu_;
+  std::vector<double> M_, part_, y_, dy_, mu_, w_;
 };
 
 }  // namespace difflcs::physics

@@ -26,6 +26,11 @@ struct Matrix {  // row by row
     numbers.assign(n * m, 0.0);
     if (diagonal != 0) add_identity(diagonal);
   }
+  void shape(int n, int m) {  // of any numbers
+    rows = n;
+    columns = m;
+    numbers.resize(n * m);
+  }
   void append(const double* row) {
     numbers.insert(numbers.end(), row, row + columns);
     rows++;
@@ -39,9 +44,9 @@ struct Matrix {  // row by row
 };
 
 // into = a b.
-DIFFLCS_CLONES static void multiply(const Matrix& a, const Matrix& b, Matrix& into) {
-  into.resize(a.rows, b.columns);
-  for (int i = 0; i < a.rows; i++) multiply(a[i], b[0], b.rows, b.columns, into[i]);
+inline void multiply(const Matrix& a, const Matrix& b, Matrix& into) {
+  into.shape(a.rows, b.columns);
+  multiply(a[0], b[0], a.rows, b.rows, b.columns, into[0]);
 }
 
 // into = aᵀ b.
@@ -54,7 +59,7 @@ DIFFLCS_CLONES static void multiply_transposed(const Matrix& a, const Matrix& b,
 
 // into = a bᵀ.
 DIFFLCS_CLONES static void multiply_rows(const Matrix& a, const Matrix& b, Matrix& into) {
-  into.resize(a.rows, b.rows);
+  into.shape(a.rows, b.rows);
   for (int i = 0; i < a.rows; i++)
     for (int j = 0; j < b.rows; j++) into[i][j] = dot(a[i], b[j], a.columns);
 }
@@ -160,7 +165,7 @@ DIFFLCS_CLONES static void diagonalise(Matrix& M, std::vector<double>& values) {
       add(-v[i], w.data(), size, M[first + i] + first);
       add(-w[i], v.data(), size, M[first + i] + first);
     }
-    multiply(v.data(), V[first], size, n, w.data());
+    multiply(v.data(), V[first], 1, size, n, w.data());
     for (int i = 0; i < size; i++) add(-beta * v[i], w.data(), n, V[first + i]);
   }
   const double tiny = std::numeric_limits<double>::epsilon();

@@ -152,14 +152,14 @@ class Rays {
       if (!is_zero(&rays_[i * nv], nv)) some_.push_back(i);
     }
     const int m = static_cast<int>(some_.size());
-    gives_.assign(nv * m, 0.0);
+    gives_.resize(nv * m);
     F_.resize(m * m);
     along_.resize(nv);
     for (int i = 0; i < m; i++) {
-      multiply(ray(i), response, nv, nv, along_.data());
+      multiply(ray(i), response, 1, nv, nv, along_.data());
       for (int v = 0; v < nv; v++) gives_[v * m + i] = along_[v] * c.seconds / c.give;
     }
-    for (int i = 0; i < m; i++) multiply(ray(i), gives_.data(), nv, m, &F_[i * m]);
+    for (int i = 0; i < m; i++) multiply(ray(i), gives_.data(), 1, nv, m, &F_[i * m]);
     for (int i = 0; i < m; i++) F_[i * m + i] += c.exact();
   }
 
@@ -480,9 +480,8 @@ class Evaluation {
     }
     // As far along the rows as what is delayed.
     push_of(a.response, rows_, by_, rows_, pushing_);
-    for (int i = 0; i < 2 * nv; i++)
-      multiply(pushing_[i % nv], a.delayed + i / nv * nv * c.columns, nv, c.columns,
-               into_->carried + i * c.columns);
+    for (int i = 0, half = nv * c.columns; i < 2; i++)
+      multiply(pushing_[0], a.delayed + i * half, nv, nv, c.columns, into_->carried + i * half);
   }
 
   bool slides(int i) const { return !is_zero(&slide_[i * common_->tangents], common_->tangents); }
@@ -497,7 +496,7 @@ class Evaluation {
     for (int r = 0; r < t; r++)
       add(a.friction[i] * slide[r] / size, into_->turned + (i * t + r) * nv, nv, ways_.data());
     // Friction that presses what it holds back into the contact could jam it; so much of it is left out.
-    multiply(normal, a.response, nv, nv, along_.data());
+    multiply(normal, a.response, 1, nv, nv, along_.data());
     const double presses = dot(along_.data(), ways_.data(), nv), yields = dot(along_.data(), normal, nv);
     add(-std::min(1.0, kPresses * yields / std::max(presses, kTiny)), ways_.data(), nv, drag_.data());
   }
