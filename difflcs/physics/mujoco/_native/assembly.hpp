@@ -32,7 +32,7 @@ struct Matrices {
 // Writes the matrices of a state, zero before; false where only their numbers say whether they are finite, F + Fᵀ ≻ 0.
 DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const Matrices& into) {
   const int nv = s.nv, nx = s.nx, rays = s.contacts * s.each(), m = s.rows(), all = s.forces(), first = m - s.bounded;
-  std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), left(std::max(nx, m) * nv), right(nv * all);
+  std::vector<double> rows(m * nv), counted(m * nv), gap(m), soft(m), left(m * nv), right(nv * all);
   const auto put = [&](int i, const double* row, bool counts, double apart, double compliance) {
     std::copy_n(row, nv, &rows[i * nv]);
     if (counts) std::copy_n(row, nv, &counted[i * nv]);
@@ -55,10 +55,9 @@ DIFFLCS_CLONES static bool assemble_state(const Layout& s, const Given& g, const
     multiply(of_rows->data(), g.turn, m, nv, nv, left.data());
     std::copy_n(left.data(), m * nv, of_rows->data());
   }
-  for (int v = 0; v < nx; v++) std::copy_n(g.response + v * nx, nv, &left[v * nv]);
   for (int i = 0; i < m; i++)
     for (int v = 0; v < nv; v++) right[v * all + i] = rows[i * nv + v] * s.force;
-  multiply(left.data(), right.data(), nx, nv, all, into.C);
+  multiply(g.response, right.data(), nx, nv, all, into.C, nx);
   for (int v = 0; v < nx && g.effect != nullptr; v++)
     for (int k = 0; k < s.others; k++) into.C[v * all + rays + s.caps + k] = g.effect[v * s.others + k] * s.force;
   for (int i = 0; i < m * nv; i++) left[i] = rows[i] / s.length;

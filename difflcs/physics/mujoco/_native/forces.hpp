@@ -69,12 +69,13 @@ void multiply_row(const double* row, const double* matrix, int m, double* into, 
   for (; k < m; k++) multiply_columns<1, 1>(row, matrix + k, m, into + k, count, at);
 }
 
-// into (rows, m) = a (rows, n) times a matrix (n, m). A row of contacts is mostly zeros.
+// into (rows, m) = a (rows, n) times a matrix (n, m), with so many numbers from a row of a to the next. A row of contacts is
+// mostly zeros.
 template <int kSide>
-void multiply_by(const double* a, const double* matrix, int rows, int n, int m, double* into) {
+void multiply_by(const double* a, const double* matrix, int rows, int n, int m, double* into, int next) {
   constexpr int kFew = 16, kMany = 256;  // numbers of a row between which those that are not zero are listed
   int some[kMany];
-  for (int i = 0; i < rows; i++, a += n, into += m) {
+  for (int i = 0; i < rows; i++, a += next, into += m) {
     int count = n;
     if (n >= kFew && n <= kMany) count = n - static_cast<int>(std::count(a, a + n, 0.0));
     if (2 * count > n) {
@@ -91,13 +92,16 @@ void multiply_by(const double* a, const double* matrix, int rows, int n, int m, 
 
 #ifdef DIFFLCS_VERSIONS
 __attribute__((target("avx2"), flatten)) static void multiply(const double* a, const double* matrix, int rows, int n, int m,
-                                                             double* into) {
-  multiply_by<4>(a, matrix, rows, n, m, into);
+                                                             double* into, int next) {
+  multiply_by<4>(a, matrix, rows, n, m, into, next);
 }
 __attribute__((target("default"), flatten))
 #endif
-static void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into) {
-  multiply_by<2>(a, matrix, rows, n, m, into);
+static void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into, int next) {
+  multiply_by<2>(a, matrix, rows, n, m, into, next);
+}
+inline void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into) {
+  multiply(a, matrix, rows, n, m, into, n);
 }
 
 // Overwrites b (n, m) by M⁻¹ b and M (n, n) by its factors, with row exchanges; false where M is singular.
@@ -201,10 +205,11 @@ class ActiveSet {
 
   // How far to go from μ to λ: all the way, or to where the derivative along it, which grows, is nearly zero.
   double search(const double* lam, const double* low, const double* high, double c, int n) const {
+    const double by = -1 / c;
     const auto slope = [&](double t) {
       double sum = 0;
       for (int i = 0; i < n; i++)
-        sum += dy_[i] * (mu_[i] + t * (lam[i] - mu_[i]) - std::clamp(-(y_[i] + t * dy_[i]) / c, low[i], high[i]));
+        sum += dy_[i] * (mu_[i] + t * (lam[i] - mu_[i]) - std::clamp((y_[i] + t * dy_[i]) * by, low[i], high[i]));
       return sum;
     };
     const double enough = kLeft * std::fabs(slope(0.0));

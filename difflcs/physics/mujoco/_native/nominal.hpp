@@ -72,12 +72,14 @@ struct Soft {
   double stiffness, damping, give, most;
   const double* impedance;
 
+  static double raise(double x, double power) { return power == 1 ? x : power == 2 ? x * x : std::pow(x, power); }
+
   // d at a depth.
   double at(double depth) const {
     const double width = std::max(impedance[2], 1e-15), middle = std::clamp(impedance[3], 1e-4, 0.9999);
     const double power = std::max(impedance[4], 1.0), x = std::min(depth / width, 1.0);
-    const double y = x <= middle ? std::pow(x, power) / std::pow(middle, power - 1)
-                                 : 1 - std::pow(1 - x, power) / std::pow(1 - middle, power - 1);
+    const double y = x <= middle ? raise(x, power) / raise(middle, power - 1)
+                                 : 1 - raise(1 - x, power) / raise(1 - middle, power - 1);
     return std::clamp(impedance[0] + y * (impedance[1] - impedance[0]), 1e-4, 0.9999);
   }
 
@@ -92,18 +94,22 @@ struct Soft {
     double r = gap, v = load.speed, by_force = 0, by_load = 0, rate = 0, free_rate = 0, total = 0;
     bool held = true, holds = true;
     for (int i = 0; i < count; i++) {
-      const double d = at(limit ? std::fabs(r) : 0.0), share = mass / (mass + (1 - d) / d * give);
-      const double spring = share * stiffness * d;
-      double damps = share * (damping - load.drag), force;
-      if (coarse) {  // steps that are longer than MuJoCo's are implicit
-        damps += h * spring;
-        const double then = damps * (v + h * free) / slower;
-        force = -(share * (free - load.turn) + spring * r + then) / (1 + h * damps / slower);
-      } else {
-        force = -damps * v - spring * r - share * (free - load.turn);
+      double force = 0;
+      held = false;
+      if (!(limit && r >= 0)) {
+        const double d = at(limit ? std::fabs(r) : 0.0), share = mass / (mass + (1 - d) / d * give);
+        const double spring = share * stiffness * d;
+        double damps = share * (damping - load.drag);
+        if (coarse) {  // steps that are longer than MuJoCo's are implicit
+          damps += h * spring;
+          const double then = damps * (v + h * free) / slower;
+          force = -(share * (free - load.turn) + spring * r + then) / (1 + h * damps / slower);
+        } else {
+          force = -damps * v - spring * r - share * (free - load.turn);
+        }
+        held = lower < force && force < upper;
+        force = std::min(std::max(force, lower), upper);
       }
-      held = limit ? r < 0 && force > 0 : lower < force && force < upper;
-      force = limit && r >= 0 ? 0.0 : std::min(std::max(force, lower), upper);
       v = (v + h * (free + force)) / slower;
       rate = (rate + h * force) / slower;
       free_rate = (free_rate + h * free) / slower;
@@ -129,43 +135,46 @@ class Rays {
                           const double* response) {
     const int nv = c.nv, each = c.each();
     common_ = &c;
-    rays_.clear();
-    number_.clear();
-    some_.clear();
-    low_.clear();
-    high_.clear();
+    for (auto* numbers : {&rays_, &low_, &high_}) numbers->clear();
+    for (auto* numbers : {&number_, &some_}) numbers->clear();
+    const auto put = [&](int number, double low, double high) {  // the last ray
+      if (is_zero(&rays_[rays_.size() - nv], nv)) {
+        rays_.resize(rays_.size() - nv);
+      } else {
+        some_.push_back(static_cast<int>(number_.size()));
+      }
+      number_.push_back(number);
+      low_.push_back(low);
+      high_.push_back(high);
+    };
     for (int k = 0; k < c.contacts; k++) {
       for (int r = 0; r < (c.rough[k] ? each : 1); r++) {  // one where all are the same
         rays_.insert(rays_.end(), a.normal + k * nv, a.normal + (k + 1) * nv);
-        number_.push_back(k * each + r);
         const double friction = r % 2 == 0 ? a.friction[k] : -a.friction[k];
         if (c.tangents > 0) add(friction, tangent + (k * c.tangents + r / 2) * nv, nv, &rays_[rays_.size() - nv]);
+        put(k * each + r, 0.0, std::numeric_limits<double>::infinity());
       }
     }
-    rays_.insert(rays_.end(), scaled.scaled_normal, scaled.scaled_normal + c.rows * nv);
-    for (int j = 0; j < c.rows; j++) number_.push_back(c.contacts * each + j);
+    for (int j = 0; j < c.rows; j++) {
+      const double most = j < c.limits() ? std::numeric_limits<double>::infinity() : c.give * scaled.bound[j - c.limits()];
+      rays_.insert(rays_.end(), scaled.scaled_normal + j * nv, scaled.scaled_normal + (j + 1) * nv);
+      put(c.contacts * each + j, j < c.limits() ? 0.0 : -most, most);
+    }
     row_gap_ = scaled.scaled_gap;
-    const int count = static_cast<int>(number_.size()), first = count - c.bounded;
-    for (int i = 0; i < count; i++) {
-      low_.push_back(i < first ? 0.0 : -c.give * scaled.bound[i - first]);
-      high_.push_back(i < first ? std::numeric_limits<double>::infinity() : c.give * scaled.bound[i - first]);
-      if (!is_zero(&rays_[i * nv], nv)) some_.push_back(i);
-    }
     const int m = static_cast<int>(some_.size());
-    gives_.resize(nv * m);
+    for (auto* numbers : {&gives_, &along_}) numbers->resize(nv * m);
     F_.resize(m * m);
-    along_.resize(nv);
-    for (int i = 0; i < m; i++) {
-      multiply(ray(i), response, 1, nv, nv, along_.data());
-      for (int v = 0; v < nv; v++) gives_[v * m + i] = along_[v] * c.seconds / c.give;
-    }
-    for (int i = 0; i < m; i++) multiply(ray(i), gives_.data(), 1, nv, m, &F_[i * m]);
+    multiply(rays_.data(), response, m, nv, nv, along_.data());
+    for (int i = 0; i < m; i++)
+      for (int v = 0; v < nv; v++) gives_[v * m + i] = along_[i * nv + v] * c.seconds / c.give;
+    multiply(rays_.data(), gives_.data(), m, nv, m, F_.data());
     for (int i = 0; i < m; i++) F_[i * m + i] += c.exact();
   }
 
   // Write where forces move ζ from `place`, with gaps of contacts, and the forces (of all rays of contacts, of rows),
-  // from which the compliance counts before. False where rounding keeps it from finding them exactly.
-  bool press(const double* place, const double* gap, double* forces, double* moved) {
+  // about what they are. The compliance counts from them, or from none. False where rounding keeps it from finding them
+  // exactly.
+  bool press(const double* place, const double* gap, bool from_them, double* forces, double* moved) {
     const Common& c = *common_;
     const int nv = c.nv, m = static_cast<int>(some_.size()), of_contacts = c.contacts * c.each();
     q_.clear();
@@ -174,14 +183,13 @@ class Rays {
     largest_.clear();
     for (size_t i = 0, next = 0; i < number_.size(); i++) {
       const int at = number_[i];
-      const double start = forces[at] * c.give;
-      const double apart = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.exact() * start;
+      const double start = forces[at] * c.give, before = from_them ? start : 0.0;
+      const double apart = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.exact() * before;
       if (static_cast<int>(next) == m || some_[next] != static_cast<int>(i)) {  // nothing moves along it
         forces[at] = std::clamp(-apart / c.exact(), low_[i], high_[i]) / c.give;
         continue;
       }
-      next++;
-      q_.push_back(apart + dot(&rays_[i * nv], place, nv));
+      q_.push_back(apart + dot(&rays_[next++ * nv], place, nv));
       lam_.push_back(start);
       least_.push_back(low_[i]);
       largest_.push_back(high_[i]);
@@ -195,17 +203,16 @@ class Rays {
 
   // Add the impulse on the degrees of freedom by forces of contacts.
   void add_impulse(const double* forces, double* into) const {
-    for (size_t i = 0; i < number_.size() - common_->rows; i++)
-      add(forces[number_[i]], &rays_[i * common_->nv], common_->nv, into);
+    const int nv = common_->nv, of_contacts = common_->contacts * common_->each();
+    for (size_t i = 0; i < some_.size() && number_[some_[i]] < of_contacts; i++)
+      add(forces[number_[some_[i]]], &rays_[i * nv], nv, into);
   }
 
  private:
-  const double* ray(int i) const { return &rays_[some_[i] * common_->nv]; }
-
   const Common* common_ = nullptr;
   const double* row_gap_ = nullptr;
   std::vector<double> rays_, low_, high_, gives_, F_, along_, q_, lam_, least_, largest_;
-  std::vector<int> number_, some_;  // the force of each ray; those along which something moves
+  std::vector<int> number_, some_;  // the force of each; those with rays along which something moves
   ActiveSet solver_;
 };
 
@@ -246,7 +253,9 @@ class Evaluation {
     closing_.resize(k);
     slides_.resize(k);
     slide_.resize(k * c.tangents);
-    forces_.resize(k * c.each() + c.rows);
+    forces_.assign(k * c.each() + c.rows, 0.0);
+    presses_.resize(2 * (c.columns - 1 - c.nx));
+    speed_.resize(c.rows);
     held_.resize(c.rows * nv);
     pushed_.resize(nv * nv);
   }
@@ -304,14 +313,13 @@ class Evaluation {
     for (int i = 0; i < k * t; i++) slide_[i] *= slides_[i / t];
     if (some) carry();  // else it is as before: what holds does not depend on the directions of the tangents
     reach(into_->carried, carried_place_.data());
-    std::fill(forces_.begin(), forces_.end(), 0.0);
-    rays_.set(c, a, into_->turned, *into_, a.response);
+    if (t > 1 || pressed_ != a.response) rays_.set(c, a, into_->turned, *into_, a.response);
     for (int pass = 0; pass < kPasses; pass++) {
       // A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
       for (int i = 0; i < k; i++)
         into_->opened[i] =
             gap_[i] + (slides_[i] ? a.friction[i] * std::sqrt(dot(&slide_[i * t], &slide_[i * t], t)) : 0);
-      exact_ &= rays_.press(carried_place_.data(), into_->opened, forces_.data(), moved_.data());
+      exact_ &= rays_.press(carried_place_.data(), into_->opened, pass > 0, forces_.data(), moved_.data());
       find_slide(moved_.data());
     }
     std::copy_n(forces_.data(), k * each, into_->forces);
@@ -332,12 +340,11 @@ class Evaluation {
     const double h = c.seconds;
     if (c.rows == 0) return;
     // First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
-    std::vector<double> speed(c.rows);
     for (int j = 0; j < c.rows; j++) {
       const Soft soft = soften(j);
-      speed[j] = dot(a.row_normal + j * nv, velocity_, nv);
-      const bool creeps = j >= k && std::fabs(speed[j]) < soft.most * soft.firm(0.0) / soft.damping;
-      scale(j, j < k ? std::max(a.row_gap[j], 0.0) + 2 * a.bend[j] : -h * speed[j] * creeps, 1.0);
+      speed_[j] = dot(a.row_normal + j * nv, velocity_, nv);
+      const bool creeps = j >= k && std::fabs(speed_[j]) < soft.most * soft.firm(0.0) / soft.damping;
+      scale(j, j < k ? std::max(a.row_gap[j], 0.0) + 2 * a.bend[j] : -h * speed_[j] * creeps, 1.0);
     }
     reach(a.delayed, carried_place_.data());
     for (int i = 0; i < c.contacts; i++) closed_[i] = std::max(a.gap[i], 0.0);
@@ -347,19 +354,17 @@ class Evaluation {
       const double *row = a.row_normal + j * nv, force = forces_[c.contacts * c.each() + j], bend = a.bend[j];
       const bool limit = j < k;
       const double after = (dot(row, moved_.data(), nv) + 2 * bend) / h;
-      Load load{speed[j], 0, 0, 2 * bend / (h * h), give_way(row, a.inverse_mass, nv)};
+      Load load{speed_[j], 0, 0, 2 * bend / (h * h), give_way(row, a.inverse_mass, nv)};
       const double gives = give_way(row, a.response, nv);
       load.drag = std::max(load.mass / std::max(gives, 1e-12 * load.mass + kTiny) - 1, 0.0) / h;
-      load.acceleration = ((after - gives * force * into_->unit[j]) * (1 + h * load.drag) - speed[j]) / h;
+      load.acceleration = ((after - gives * force * into_->unit[j]) * (1 + h * load.drag) - speed_[j]) / h;
       // The same with the action that presses a limit most.
       double faster = 0, both = 0, squared = 0;
+      std::fill(presses_.begin(), presses_.end(), 0.0);
+      for (int i = 0; i < 2 * nv; i++)
+        if (row[i % nv] != 0) add(row[i % nv], a.step + i * c.columns + c.nx, nu, &presses_[i / nv * nu]);
       for (int u = 0; u < nu; u++) {
-        double far = 0, fast = 0;
-        for (int v = 0; v < nv; v++) {
-          if (row[v] == 0) continue;
-          far += row[v] * a.step[v * c.columns + c.nx + u];
-          fast += row[v] * a.step[(nv + v) * c.columns + c.nx + u];
-        }
+        const double far = presses_[u], fast = presses_[nu + u];
         faster += std::fabs(fast) * c.reach[u];
         both += far * fast;
         squared += fast * fast;
@@ -379,7 +384,7 @@ class Evaluation {
         const double rest = (then.speed - most.speed) / std::max(faster, kTiny);
         part = std::clamp(late / std::max(1 - rest, 0.05), kPressedFrom, kPressedTo);
         // What is reached in the step has its gap where the force stops it as at the nominal action.
-        const double stopped = then.speed - (speed[j] + h * load.acceleration) / (1 + h * load.drag);
+        const double stopped = then.speed - (speed_[j] + h * load.acceleration) / (1 + h * load.drag);
         if (then.acts && a.row_gap[j] > 0) gap -= (part - then.part) * h * stopped;
       }
       scale(j, gap, (!limit && then.stops) || at_once ? 1.0 : part);
@@ -413,8 +418,9 @@ class Evaluation {
   // Find forces, none before, and where they move to.
   void press(const double* response, const double* place, const double* gap, bool writes) {
     rays_.set(*common_, *acting_, into_->turned, *into_, response);
-    spare_.assign(forces_.size(), 0.0);
-    exact_ &= rays_.press(place, gap, writes ? (forces_ = spare_).data() : spare_.data(), moved_.data());
+    pressed_ = response;
+    spare_ = forces_;
+    exact_ &= rays_.press(place, gap, false, writes ? forces_.data() : spare_.data(), moved_.data());
   }
 
   // Find the contacts that close as bodies move to ζ, stacked bodies held up in turn. The rows `held_` do not move.
@@ -624,11 +630,11 @@ class Evaluation {
   const Common* common_ = nullptr;
   const Acting* acting_ = nullptr;
   const Evaluated* into_ = nullptr;
-  const double* velocity_ = nullptr;
+  const double *velocity_ = nullptr, *pressed_ = nullptr;  // pressed_: the response of the rays
   bool exact_ = true;
   std::vector<double> place_, carried_place_;  // ζ and ν afterwards: without contact, and as loads are carried
   std::vector<double> moved_, ways_, fast_, drag_, along_, closed_, gap_, norm_, slide_, forces_, held_, pushed_,
-      spare_;
+      spare_, presses_, speed_;
   Matrix rows_, by_, pushing_;
   std::vector<char> closing_, slides_;
   Rays rays_;

@@ -52,8 +52,8 @@ class StepMaker {
     const double h = c_.seconds / c_.simulated.count;
     for (const bool brakes : {false, true}) {  // which overshoot without growing, and have no derivative
       if (way == kDiscrete || (brakes && is_zero(c_.brakes.data(), nv_))) break;
-      one_.resize(nv_, nv_);
-      two_.resize(nv_, nv_);
+      one_.shape(nv_, nv_);
+      two_.shape(nv_, nv_);
       for (int i = 0; i < nv_; i++) {
         const double *row = rates + i * (columns_ - 1), *moves = inverse_mass + i * nv_;
         for (int j = 0; j < nv_; j++) {
@@ -79,7 +79,7 @@ class StepMaker {
     if (!factor(factor_)) return false;
     invert_lower(factor_, back_);
     multiply_transposed(back_, back_, mass_);
-    forces_.resize(nv_ + c_.na, columns_);
+    forces_.shape(nv_ + c_.na, columns_);
     for (int i = 0; i < forces_.rows; i++) {
       std::copy_n(m.rates + i * (columns_ - 1), columns_ - 1, forces_[i]);
       forces_[i][columns_ - 1] = m.acceleration[i];
@@ -167,7 +167,7 @@ class StepMaker {
   // Write S, the change of velocity by an impulse in a step of h, with forces that resist motion treated implicitly. It
   // takes L of M⁻¹ and L⁻¹, as M itself has lost the lightest bodies to rounding where some are 10¹⁰ times as heavy.
   void respond(double h, Matrix& response) {
-    one_.resize(nv_, nv_);
+    one_.shape(nv_, nv_);
     for (int i = 0; i < nv_; i++)
       for (int j = 0; j < nv_; j++) one_[i][j] = -h * (forces_[i][nv_ + j] + h * forces_[i][j]);
     relate();
@@ -201,22 +201,24 @@ class StepMaker {
     for (int i = 0; i < nx_; i++) implicit_[i][i] += i < nv_ || i >= 2 * nv_;
   }
 
-  // Write to `grown_` the matrix of time steps, square with rows of u − ū and 1. Implicit damping is that of all
-  // forces, or of joints alone.
+  // Write to `grown_` the matrix of time steps, without the rows of u − ū and 1. Implicit damping is that of all forces,
+  // or of joints alone.
   void follow(const TimeSteps& by, const Matrix& mass, bool of_joints) {
     const double h = c_.seconds / by.count;
-    const auto grow = [&](Matrix& by) {
-      multiply(by, once_, one_);
+    const auto grow = [&](Matrix& by, bool holds) {  // u − ū and 1, as in a step but not in its rates
+      one_.shape(nx_, columns_);
+      multiply(by[0], once_[0], nx_, nx_, columns_, one_[0], columns_);
+      for (int i = 0; i < nx_ && holds; i++) add(1.0, by[i] + nx_, columns_ - nx_, one_[i] + nx_);
       std::swap(by, one_);
     };
-    once_.resize(columns_, columns_);
-    grown_.resize(columns_, columns_, 1.0);
+    once_.resize(nx_, columns_);
     for (int k = 0; k < c_.na; k++) add(by.durations[k], forces_[nv_ + k], columns_, once_[2 * nv_ + k]);
     if (by.way == kRungeKutta) {
       for (int i = 0; i < nv_; i++) once_[i][nv_ + i] = h;
       for (int i = 0; i < nv_; i++) add(h, forces_[i], columns_, once_[nv_ + i]);
+      grown_.resize(nx_, columns_, 1.0);
       for (int k = 4; k > 0; k--) {
-        grow(grown_);
+        grow(grown_, false);
         for (double& number : grown_.numbers) number /= k;
         grown_.add_identity();
       }
@@ -227,10 +229,12 @@ class StepMaker {
       for (int i = 0; i < nv_; i++) add(h, rates_[i], columns_, once_[nv_ + i]);
       for (int i = 0; i < nv_; i++) add(h, once_[nv_ + i], columns_, once_[i]);
     }
-    grown_.resize(columns_, columns_, 1.0);
+    bool begun = false;
     for (int left = by.count; left > 0; left /= 2) {
-      if (left % 2 > 0) grow(grown_);
-      if (left > 1) grow(once_);
+      if (left % 2 > 0 && begun) grow(grown_, true);
+      if (left % 2 > 0 && !begun) grown_ = once_;
+      begun = begun || left % 2 > 0;
+      if (left > 1) grow(once_, true);
     }
   }
 
