@@ -30,14 +30,26 @@ bool is_zero(const T* row, int n) {
 }
 
 inline double dot(const double* a, const double* b, int n) {
+  typedef double Two __attribute__((vector_size(16), aligned(8), may_alias));
+  const auto two = [](const double* from) { return *reinterpret_cast<const Two*>(from); };
   double sums[8] = {}, sum = 0;  // side by side
   int k = 0;
-  for (; k + 8 <= n; k += 8)
-    for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
+  if (n < 16) {
+    Two one{}, other{};
+    for (; k + 4 <= n; k += 4) {
+      one += two(a + k) * two(b + k);
+      other += two(a + k + 2) * two(b + k + 2);
+    }
+    one += other;
+    sum = one[0] + one[1];
+  } else {
+    for (; k + 8 <= n; k += 8)
+      for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
+    for (int l = 0; l < 4; l++) sums[l] += sums[l + 4];
+    sum = (sums[0] + sums[2]) + (sums[1] + sums[3]);
+  }
   for (; k < n; k++) sum += a[k] * b[k];
-  if (n < 8) return sum;
-  for (int l = 0; l < 4; l++) sums[l] += sums[l + 4];
-  return sum + (sums[0] + sums[2]) + (sums[1] + sums[3]);
+  return sum;
 }
 
 // into += factor · row: what a compiler can do side by side.

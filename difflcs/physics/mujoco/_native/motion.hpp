@@ -52,7 +52,7 @@ class Reader {
     hold(ctrl);
     for (int j = 0; j < m.nu; j++)
       into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? place_.actuator_length[j] : 0.0);
-    simulate(m.steps / 2);
+    simulate(m.steps / 2, kPositions);
     double *held = memory + m.size() + m.nq + m.nv + m.na + m.nu, *applied = held + m.nv;
     if (m.held) forward(m.simulated);
     std::copy_n(place_.qfrc_constraint, m.nv, held);
@@ -120,12 +120,12 @@ class Reader {
     }
   }
 
-  void forward(const void* model) const { library_.forward(model, place_.data, 0, 1); }
+  void forward(const void* model, int known = 0) const { library_.forward(model, place_.data, known, 1); }
 
-  // Without the checks of `mj_step`, which warn of a motion that grows.
-  void simulate(int steps) const {
-    for (int k = 0; k < steps; k++) {
-      forward(motion_.simulated);
+  // Without the checks of `mj_step`, which warn of a motion that grows; `known`: the stages that are computed already.
+  void simulate(int steps, int known = 0) const {
+    for (int k = 0; k < steps; k++, known = 0) {
+      forward(motion_.simulated, known);
       if (motion_.advance != nullptr) {
         motion_.advance(motion_.simulated, place_.data);
       } else {

@@ -89,7 +89,7 @@ struct Soft {
   Followed follow(double gap, const Load& load, double seconds, int count) const {
     const bool coarse = count > kMostSteps, limit = std::isinf(most);
     count = std::min(count, kMostSteps);
-    const double h = seconds / count, mass = std::max(load.mass, kTiny), slower = 1 + h * load.drag;
+    const double h = seconds / count, mass = std::max(load.mass, kTiny), slower = 1 / (1 + h * load.drag);
     const double upper = mass * most, lower = limit ? 0.0 : -upper, free = load.acceleration;
     double r = gap, v = load.speed, by_force = 0, by_load = 0, rate = 0, free_rate = 0, total = 0;
     bool held = true, holds = true;
@@ -102,17 +102,17 @@ struct Soft {
         double damps = share * (damping - load.drag);
         if (coarse) {  // steps that are longer than MuJoCo's are implicit
           damps += h * spring;
-          const double then = damps * (v + h * free) / slower;
-          force = -(share * (free - load.turn) + spring * r + then) / (1 + h * damps / slower);
+          const double then = damps * (v + h * free) * slower;
+          force = -(share * (free - load.turn) + spring * r + then) / (1 + h * damps * slower);
         } else {
           force = -damps * v - spring * r - share * (free - load.turn);
         }
         held = lower < force && force < upper;
         force = std::min(std::max(force, lower), upper);
       }
-      v = (v + h * (free + force)) / slower;
-      rate = (rate + h * force) / slower;
-      free_rate = (free_rate + h * free) / slower;
+      v = (v + h * (free + force)) * slower;
+      rate = (rate + h * force) * slower;
+      free_rate = (free_rate + h * free) * slower;
       r += h * v;
       by_force += h * rate;
       by_load += h * free_rate;

@@ -90,8 +90,6 @@ class StepMaker {
     if (equalities > 0) hold(m, equalities, into.inverse_mass);
     for (int i = 0; i < forces_.rows; i++)  // with ν = 0, ζ = 0 and u = ū
       forces_[i][columns_ - 1] -= dot(forces_[i], m.middle, nx_);
-    for (int i = 0; i < nv_; i++)
-      for (int j = 0; j < nv_; j++) add(-heavier_[i][j], forces_[j] + nv_, nv_, slow_[i]);
     respond(c_.seconds, response_);
     std::copy_n(response_[0], nv_ * nv_, into.response);
     move_at_once();
@@ -257,7 +255,10 @@ class StepMaker {
       if (of_joints && is_zero(c_.damping.data(), nv_)) return;
       one_ = two_ = mass;
       for (int i = 0; i < nv_ && of_joints; i++) two_[i][i] += h * c_.damping[i];
-      for (int i = 0; i < nv_ && !of_joints; i++) add(h, slow_[i], nv_, two_[i]);
+      for (int i = 0; i < nv_ && !of_joints; i++) {
+        add(h, slow_[i], nv_, two_[i]);
+        for (int j = 0; j < nv_; j++) add(-h * heavier_[i][j], forces_[j] + nv_, nv_, two_[i]);
+      }
     }
     multiply(one_, rates_, left_);
     solve(two_, left_);
@@ -288,7 +289,7 @@ class StepMaker {
 
   const Dynamics& c_;
   const int nv_, nx_, columns_;
-  // L of M⁻¹ and L⁻¹; M, M with what equality constraints add; damping by forces; S.
+  // L of M⁻¹ and L⁻¹; M, M with what equality constraints add; damping that they add; S.
   Matrix factor_, back_, mass_, heavier_, slow_, response_;
   Matrix forces_, rates_;  // (nv + na, columns) rates by the state, u − ū and 1; (nv, columns) those of velocities
   Matrix implicit_, grown_, once_, one_, two_, left_, rows_;
