@@ -162,13 +162,11 @@ class Rays {
     }
     row_gap_ = scaled.scaled_gap;
     const int m = static_cast<int>(some_.size());
-    for (auto* numbers : {&gives_, &along_}) numbers->resize(nv * m);
-    F_.resize(m * m);
+    along_.resize(nv * m);
     multiply(rays_.data(), response, m, nv, nv, along_.data());
-    for (int i = 0; i < m; i++)
-      for (int v = 0; v < nv; v++) gives_[v * m + i] = along_[i * nv + v] * c.seconds / c.give;
-    multiply(rays_.data(), gives_.data(), m, nv, m, F_.data());
-    for (int i = 0; i < m; i++) F_[i * m + i] += c.exact();
+    for (double& number : along_) number *= c.seconds / c.give;
+    near_.clear();
+    is_near_.assign(m, false);
   }
 
   // Write where forces move ζ from `place`, with gaps of contacts, and the forces (of all rays of contacts, of rows),
@@ -177,10 +175,9 @@ class Rays {
   bool press(const double* place, const double* gap, bool from_them, double* forces, double* moved) {
     const Common& c = *common_;
     const int nv = c.nv, m = static_cast<int>(some_.size()), of_contacts = c.contacts * c.each();
+    double within = 0;
     q_.clear();
     lam_.clear();
-    least_.clear();
-    largest_.clear();
     for (size_t i = 0, next = 0; i < number_.size(); i++) {
       const int at = number_[i];
       const double start = forces[at] * c.give, before = from_them ? start : 0.0;
@@ -191,13 +188,28 @@ class Rays {
       }
       q_.push_back(apart + dot(&rays_[next++ * nv], place, nv));
       lam_.push_back(start);
-      least_.push_back(low_[i]);
-      largest_.push_back(high_[i]);
+      within = std::max(within, -q_.back());
     }
-    const bool found =
-        m == 0 || solver_.solve(F_.data(), q_.data(), least_.data(), largest_.data(), c.exact(), m, lam_.data());
+    // Those that are far from closing have no force, if they do not close by the forces of the others.
+    bool found = true;
+    along_forces_.assign(nv, 0.0);
+    for (bool first = true;; first = false, within = 0) {
+      const size_t before = near_.size();
+      for (int i = 0; i < m; i++) {
+        if (is_near_[i] || !(lam_[i] != 0 || low_[some_[i]] < 0 ||
+                             q_[i] + dot(&rays_[i * nv], along_forces_.data(), nv) < within))
+          continue;
+        is_near_[i] = true;
+        near_.push_back(i);
+      }
+      if (near_.empty() || (!first && near_.size() == before)) break;
+      if (near_.size() > before) relate();
+      found = solve();
+      std::fill(along_forces_.begin(), along_forces_.end(), 0.0);
+      for (const int i : near_) add(lam_[i], &along_[i * nv], nv, along_forces_.data());
+    }
     for (int i = 0; i < m; i++) forces[number_[some_[i]]] = lam_[i] / c.give;
-    for (int v = 0; v < nv; v++) moved[v] = place[v] + dot(&gives_[v * m], lam_.data(), m);
+    for (int v = 0; v < nv; v++) moved[v] = place[v] + along_forces_[v];
     return found;
   }
 
@@ -209,10 +221,43 @@ class Rays {
   }
 
  private:
+  // Write the F of those that are near.
+  void relate() {
+    const int nv = common_->nv, k = static_cast<int>(near_.size());
+    rows_.resize(k * nv);
+    gives_.resize(k * nv);
+    F_.resize(k * k);
+    for (int i = 0; i < k; i++) {
+      std::copy_n(&rays_[near_[i] * nv], nv, &rows_[i * nv]);
+      for (int v = 0; v < nv; v++) gives_[v * k + i] = along_[near_[i] * nv + v];
+    }
+    multiply(rows_.data(), gives_.data(), k, nv, k, F_.data());
+    for (int i = 0; i < k; i++) F_[i * k + i] += common_->exact();
+  }
+
+  // Find the forces of those that are near.
+  bool solve() {
+    const int k = static_cast<int>(near_.size());
+    for (auto* numbers : {&gap_, &least_, &largest_, &part_}) numbers->resize(k);
+    for (int i = 0; i < k; i++) {
+      const int at = near_[i];
+      gap_[i] = q_[at];
+      least_[i] = low_[some_[at]];
+      largest_[i] = high_[some_[at]];
+      part_[i] = lam_[at];
+    }
+    const bool found =
+        solver_.solve(F_.data(), gap_.data(), least_.data(), largest_.data(), common_->exact(), k, part_.data());
+    for (int i = 0; i < k; i++) lam_[near_[i]] = part_[i];
+    return found;
+  }
+
   const Common* common_ = nullptr;
   const double* row_gap_ = nullptr;
-  std::vector<double> rays_, low_, high_, gives_, F_, along_, q_, lam_, least_, largest_;
-  std::vector<int> number_, some_;  // the force of each; those with rays along which something moves
+  // Rays, and how their forces move ζ; the same of those that are near.
+  std::vector<double> rays_, low_, high_, along_, q_, lam_, along_forces_, rows_, gives_, F_, gap_, least_, largest_, part_;
+  std::vector<char> is_near_;
+  std::vector<int> near_, number_, some_;  // the force of each; those with rays along which something moves
   ActiveSet solver_;
 };
 
