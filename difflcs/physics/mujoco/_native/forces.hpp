@@ -31,25 +31,20 @@ bool is_zero(const T* row, int n) {
 
 inline double dot(const double* a, const double* b, int n) {
   typedef double Two __attribute__((vector_size(16), aligned(8), may_alias));
-  const auto two = [](const double* from) { return *reinterpret_cast<const Two*>(from); };
+  const auto by_two = [&](int k) { return *reinterpret_cast<const Two*>(a + k) * *reinterpret_cast<const Two*>(b + k); };
   double sums[8] = {}, sum = 0;  // side by side
+  Two one{}, other{};
   int k = 0;
-  if (n < 16) {
-    Two one{}, other{};
-    for (; k + 4 <= n; k += 4) {
-      one += two(a + k) * two(b + k);
-      other += two(a + k + 2) * two(b + k + 2);
-    }
-    one += other;
-    sum = one[0] + one[1];
-  } else {
-    for (; k + 8 <= n; k += 8)
-      for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
-    for (int l = 0; l < 4; l++) sums[l] += sums[l + 4];
-    sum = (sums[0] + sums[2]) + (sums[1] + sums[3]);
+  for (; n >= 16 && k + 8 <= n; k += 8)
+    for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
+  for (int l = 0; n >= 16 && l < 4; l++) sum += sums[l] + sums[l + 4];
+  for (; k + 4 <= n; k += 4) {
+    one += by_two(k);
+    other += by_two(k + 2);
   }
+  one += other;
   for (; k < n; k++) sum += a[k] * b[k];
-  return sum;
+  return sum + (one[0] + one[1]);
 }
 
 // into += factor · row: what a compiler can do side by side.
@@ -57,48 +52,39 @@ inline void add(double factor, const double* row, int n, double* __restrict into
   for (int k = 0; k < n; k++) into[k] += factor * row[k];
 }
 
-// So many columns of a row times a matrix (·, m), by `kSide` side by side; `at`: which numbers of the row count.
-template <int kSide, int kTimes, class At>
-void multiply_columns(const double* row, const double* matrix, int m, double* into, int count, At at) {
+// So many columns of a row times a matrix (·, m), by `kSide` side by side, of `count` numbers, or of `some`.
+template <int kSide, int kTimes>
+void multiply_columns(const double* row, const int* some, int count, const double* matrix, int m, double* into) {
   typedef double Side __attribute__((vector_size(8 * kSide), aligned(8), may_alias));
   Side sums[kTimes]{};
   for (int c = 0; c < count; c++) {
-    const int v = at(c);
+    const int v = some == nullptr ? c : some[c];
     for (int k = 0; k < kTimes; k++) sums[k] += row[v] * *reinterpret_cast<const Side*>(matrix + v * m + kSide * k);
   }
   for (int k = 0; k < kTimes; k++) *reinterpret_cast<Side*>(into + kSide * k) = sums[k];
 }
 
-template <int kSide, class At>
-void multiply_row(const double* row, const double* matrix, int m, double* into, int count, At at) {
-  int k = 0;
-  for (; k + 4 * kSide <= m; k += 4 * kSide) multiply_columns<kSide, 4>(row, matrix + k, m, into + k, count, at);
-  for (; k + 2 * kSide <= m; k += 2 * kSide) multiply_columns<kSide, 2>(row, matrix + k, m, into + k, count, at);
-  for (; k < m && m >= kSide; k += kSide) {  // at last some that are there already
-    k = std::min(k, m - kSide);
-    multiply_columns<kSide, 1>(row, matrix + k, m, into + k, count, at);
-  }
-  for (; k < m; k++) multiply_columns<1, 1>(row, matrix + k, m, into + k, count, at);
-}
-
 // into (rows, m) = a (rows, n) times a matrix (n, m), with so many numbers from a row of a to the next. A row of contacts is
-// mostly zeros.
+// mostly zeros: where it is long, the others are listed.
 template <int kSide>
 void multiply_by(const double* a, const double* matrix, int rows, int n, int m, double* into, int next) {
-  constexpr int kFew = 16, kMany = 256;  // numbers of a row between which those that are not zero are listed
-  int some[kMany];
+  constexpr int kFew = 16, kMany = 256;
+  int list[kMany];
   for (int i = 0; i < rows; i++, a += next, into += m) {
-    int count = n;
-    if (n >= kFew && n <= kMany) count = n - static_cast<int>(std::count(a, a + n, 0.0));
-    if (2 * count > n) {
-      multiply_row<kSide>(a, matrix, m, into, n, [](int c) { return c; });
-      continue;
-    }
-    for (int v = 0, c = 0; c < count; v++) {
-      some[c] = v;
+    int k = 0, count = n >= kFew && n <= kMany ? n - static_cast<int>(std::count(a, a + n, 0.0)) : n;
+    const int* some = 2 * count > n ? nullptr : list;
+    if (some == nullptr) count = n;
+    for (int v = 0, c = 0; c < count && some != nullptr; v++) {
+      list[c] = v;
       c += a[v] != 0;
     }
-    multiply_row<kSide>(a, matrix, m, into, count, [&](int c) { return some[c]; });
+    for (; k + 4 * kSide <= m; k += 4 * kSide) multiply_columns<kSide, 4>(a, some, count, matrix + k, m, into + k);
+    for (; k + 2 * kSide <= m; k += 2 * kSide) multiply_columns<kSide, 2>(a, some, count, matrix + k, m, into + k);
+    for (; k < m && m >= kSide; k += kSide) {  // at last some that are there already
+      k = std::min(k, m - kSide);
+      multiply_columns<kSide, 1>(a, some, count, matrix + k, m, into + k);
+    }
+    for (; k < m; k++) multiply_columns<1, 1>(a, some, count, matrix + k, m, into + k);
   }
 }
 

@@ -135,38 +135,29 @@ class Rays {
                           const double* response) {
     const int nv = c.nv, each = c.each();
     common_ = &c;
+    response_ = response;
     for (auto* numbers : {&rays_, &low_, &high_}) numbers->clear();
-    for (auto* numbers : {&number_, &some_}) numbers->clear();
-    const auto put = [&](int number, double low, double high) {  // the last ray
-      if (is_zero(&rays_[rays_.size() - nv], nv)) {
-        rays_.resize(rays_.size() - nv);
-      } else {
-        some_.push_back(static_cast<int>(number_.size()));
-      }
-      number_.push_back(number);
-      low_.push_back(low);
-      high_.push_back(high);
-    };
+    number_.clear();
+    near_.clear();
     for (int k = 0; k < c.contacts; k++) {
       for (int r = 0; r < (c.rough[k] ? each : 1); r++) {  // one where all are the same
         rays_.insert(rays_.end(), a.normal + k * nv, a.normal + (k + 1) * nv);
+        number_.push_back(k * each + r);
         const double friction = r % 2 == 0 ? a.friction[k] : -a.friction[k];
         if (c.tangents > 0) add(friction, tangent + (k * c.tangents + r / 2) * nv, nv, &rays_[rays_.size() - nv]);
-        put(k * each + r, 0.0, std::numeric_limits<double>::infinity());
       }
     }
-    for (int j = 0; j < c.rows; j++) {
-      const double most = j < c.limits() ? std::numeric_limits<double>::infinity() : c.give * scaled.bound[j - c.limits()];
-      rays_.insert(rays_.end(), scaled.scaled_normal + j * nv, scaled.scaled_normal + (j + 1) * nv);
-      put(c.contacts * each + j, j < c.limits() ? 0.0 : -most, most);
-    }
+    rays_.insert(rays_.end(), scaled.scaled_normal, scaled.scaled_normal + c.rows * nv);
+    for (int j = 0; j < c.rows; j++) number_.push_back(c.contacts * each + j);
     row_gap_ = scaled.scaled_gap;
-    const int m = static_cast<int>(some_.size());
-    along_.resize(nv * m);
-    multiply(rays_.data(), response, m, nv, nv, along_.data());
-    for (double& number : along_) number *= c.seconds / c.give;
-    near_.clear();
-    is_near_.assign(m, false);
+    const int count = static_cast<int>(number_.size()), first = count - c.bounded;
+    kind_.resize(count);
+    for (auto* numbers : {&apart_, &q_, &lam_}) numbers->resize(count);
+    for (int i = 0; i < count; i++) {
+      low_.push_back(i < first ? 0.0 : -c.give * scaled.bound[i - first]);
+      high_.push_back(i < first ? std::numeric_limits<double>::infinity() : c.give * scaled.bound[i - first]);
+      kind_[i] = is_zero(&rays_[i * nv], nv) ? kStill : kFar;
+    }
   }
 
   // Write where forces move ζ from `place`, with gaps of contacts, and the forces (of all rays of contacts, of rows),
@@ -174,77 +165,65 @@ class Rays {
   // exactly.
   bool press(const double* place, const double* gap, bool from_them, double* forces, double* moved) {
     const Common& c = *common_;
-    const int nv = c.nv, m = static_cast<int>(some_.size()), of_contacts = c.contacts * c.each();
+    const int nv = c.nv, of_contacts = c.contacts * c.each(), count = static_cast<int>(number_.size());
     double within = 0;
-    q_.clear();
-    lam_.clear();
-    for (size_t i = 0, next = 0; i < number_.size(); i++) {
+    for (int i = 0; i < count; i++) {
       const int at = number_[i];
       const double start = forces[at] * c.give, before = from_them ? start : 0.0;
-      const double apart = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.exact() * before;
-      if (static_cast<int>(next) == m || some_[next] != static_cast<int>(i)) {  // nothing moves along it
-        forces[at] = std::clamp(-apart / c.exact(), low_[i], high_[i]) / c.give;
-        continue;
-      }
-      q_.push_back(apart + dot(&rays_[next++ * nv], place, nv));
-      lam_.push_back(start);
-      within = std::max(within, -q_.back());
+      apart_[i] = (at < of_contacts ? gap[at / c.each()] : row_gap_[at - of_contacts]) - c.exact() * before;
+      lam_[i] = kind_[i] == kStill ? std::clamp(-apart_[i] / c.exact(), low_[i], high_[i]) : start;
+      if (kind_[i] == kStill) continue;
+      q_[i] = apart_[i] + dot(&rays_[i * nv], place, nv);
+      within = std::max(within, -q_[i]);
     }
-    // Those that are far from closing have no force, if they do not close by the forces of the others.
+    // What is far from closing has no force, if it does not close by the forces of the others.
+    std::copy_n(place, nv, moved);
     bool found = true;
-    along_forces_.assign(nv, 0.0);
     for (bool first = true;; first = false, within = 0) {
       const size_t before = near_.size();
-      for (int i = 0; i < m; i++) {
-        if (is_near_[i] || !(lam_[i] != 0 || low_[some_[i]] < 0 ||
-                             q_[i] + dot(&rays_[i * nv], along_forces_.data(), nv) < within))
+      for (int i = 0; i < count; i++) {
+        if (kind_[i] != kFar ||
+            !(lam_[i] != 0 || low_[i] < 0 || apart_[i] + dot(&rays_[i * nv], moved, nv) < within))
           continue;
-        is_near_[i] = true;
+        kind_[i] = kNear;
         near_.push_back(i);
       }
       if (near_.empty() || (!first && near_.size() == before)) break;
-      if (near_.size() > before) relate();
-      found = solve();
-      std::fill(along_forces_.begin(), along_forces_.end(), 0.0);
-      for (const int i : near_) add(lam_[i], &along_[i * nv], nv, along_forces_.data());
+      found = solve(near_.size() > before);
+      std::copy_n(place, nv, moved);
+      for (size_t i = 0; i < near_.size(); i++) add(part_[i], &along_[i * nv], nv, moved);
     }
-    for (int i = 0; i < m; i++) forces[number_[some_[i]]] = lam_[i] / c.give;
-    for (int v = 0; v < nv; v++) moved[v] = place[v] + along_forces_[v];
+    for (int i = 0; i < count; i++) forces[number_[i]] = lam_[i] / c.give;
     return found;
   }
 
   // Add the impulse on the degrees of freedom by forces of contacts.
   void add_impulse(const double* forces, double* into) const {
-    const int nv = common_->nv, of_contacts = common_->contacts * common_->each();
-    for (size_t i = 0; i < some_.size() && number_[some_[i]] < of_contacts; i++)
-      add(forces[number_[some_[i]]], &rays_[i * nv], nv, into);
+    for (size_t i = 0; i < number_.size() - common_->rows; i++)
+      add(forces[number_[i]], &rays_[i * common_->nv], common_->nv, into);
   }
 
  private:
-  // Write the F of those that are near.
-  void relate() {
-    const int nv = common_->nv, k = static_cast<int>(near_.size());
-    rows_.resize(k * nv);
-    gives_.resize(k * nv);
-    F_.resize(k * k);
-    for (int i = 0; i < k; i++) {
-      std::copy_n(&rays_[near_[i] * nv], nv, &rows_[i * nv]);
-      for (int v = 0; v < nv; v++) gives_[v * k + i] = along_[near_[i] * nv + v];
-    }
-    multiply(rows_.data(), gives_.data(), k, nv, k, F_.data());
-    for (int i = 0; i < k; i++) F_[i * k + i] += common_->exact();
-  }
+  enum Kind : char { kStill, kFar, kNear };  // kStill: nothing moves along it
 
-  // Find the forces of those that are near.
-  bool solve() {
-    const int k = static_cast<int>(near_.size());
+  // Find the forces of those that are near, which are `more` than before.
+  bool solve(bool more) {
+    const int nv = common_->nv, k = static_cast<int>(near_.size());
     for (auto* numbers : {&gap_, &least_, &largest_, &part_}) numbers->resize(k);
     for (int i = 0; i < k; i++) {
-      const int at = near_[i];
-      gap_[i] = q_[at];
-      least_[i] = low_[some_[at]];
-      largest_[i] = high_[some_[at]];
-      part_[i] = lam_[at];
+      gap_[i] = q_[near_[i]];
+      least_[i] = low_[near_[i]];
+      largest_[i] = high_[near_[i]];
+      part_[i] = lam_[near_[i]];
+    }
+    if (more) {
+      for (auto* numbers : {&rows_, &along_, &gives_}) numbers->resize(k * nv);
+      F_.resize(k * k);
+      for (int i = 0; i < k; i++) std::copy_n(&rays_[near_[i] * nv], nv, &rows_[i * nv]);
+      multiply(rows_.data(), response_, k, nv, nv, along_.data());
+      for (int i = 0; i < k * nv; i++) gives_[i % nv * k + i / nv] = along_[i] *= common_->seconds / common_->give;
+      multiply(rows_.data(), gives_.data(), k, nv, k, F_.data());
+      for (int i = 0; i < k; i++) F_[i * k + i] += common_->exact();
     }
     const bool found =
         solver_.solve(F_.data(), gap_.data(), least_.data(), largest_.data(), common_->exact(), k, part_.data());
@@ -253,11 +232,12 @@ class Rays {
   }
 
   const Common* common_ = nullptr;
-  const double* row_gap_ = nullptr;
-  // Rays, and how their forces move ζ; the same of those that are near.
-  std::vector<double> rays_, low_, high_, along_, q_, lam_, along_forces_, rows_, gives_, F_, gap_, least_, largest_, part_;
-  std::vector<char> is_near_;
-  std::vector<int> near_, number_, some_;  // the force of each; those with rays along which something moves
+  const double *row_gap_ = nullptr, *response_ = nullptr;
+  std::vector<double> rays_, low_, high_, apart_, q_, lam_;
+  // Of those that are near; `along_`: how forces move ζ, and `gives_`, transposed.
+  std::vector<double> rows_, along_, gives_, F_, gap_, least_, largest_, part_;
+  std::vector<Kind> kind_;
+  std::vector<int> number_, near_;  // the force of each ray
   ActiveSet solver_;
 };
 
