@@ -31,7 +31,7 @@ bool is_zero(const T* row, int n) {
 
 inline double dot(const double* a, const double* b, int n) {
   typedef double Two __attribute__((vector_size(16), aligned(8), may_alias));
-  const auto by_two = [&](int k) { return *reinterpret_cast<const Two*>(a + k) * *reinterpret_cast<const Two*>(b + k); };
+  const auto two = [](const double* from) { return *reinterpret_cast<const Two*>(from); };
   double sums[8] = {}, sum = 0;  // side by side
   Two one{}, other{};
   int k = 0;
@@ -39,8 +39,8 @@ inline double dot(const double* a, const double* b, int n) {
     for (int l = 0; l < 8; l++) sums[l] += a[k + l] * b[k + l];
   for (int l = 0; n >= 16 && l < 4; l++) sum += sums[l] + sums[l + 4];
   for (; k + 4 <= n; k += 4) {
-    one += by_two(k);
-    other += by_two(k + 2);
+    one += two(a + k) * two(b + k);
+    other += two(a + k + 2) * two(b + k + 2);
   }
   one += other;
   for (; k < n; k++) sum += a[k] * b[k];
@@ -64,8 +64,8 @@ void multiply_columns(const double* row, const int* some, int count, const doubl
   for (int k = 0; k < kTimes; k++) *reinterpret_cast<Side*>(into + kSide * k) = sums[k];
 }
 
-// into (rows, m) = a (rows, n) times a matrix (n, m), with so many numbers from a row of a to the next. A row of contacts is
-// mostly zeros: where it is long, the others are listed.
+// into (rows, m) = a (rows, n) times a matrix (n, m), with so many numbers from a row of a to the next. A row of contacts
+// is mostly zeros: where it is long, the others are listed.
 template <int kSide>
 void multiply_by(const double* a, const double* matrix, int rows, int n, int m, double* into, int next) {
   constexpr int kFew = 16, kMany = 256;
@@ -89,8 +89,8 @@ void multiply_by(const double* a, const double* matrix, int rows, int n, int m, 
 }
 
 #ifdef DIFFLCS_VERSIONS
-__attribute__((target("avx2"), flatten)) static void multiply(const double* a, const double* matrix, int rows, int n, int m,
-                                                             double* into, int next) {
+__attribute__((target("avx2"), flatten)) static void multiply(const double* a, const double* matrix, int rows, int n,
+                                                              int m, double* into, int next) {
   multiply_by<4>(a, matrix, rows, n, m, into, next);
 }
 __attribute__((target("default"), flatten))
@@ -98,6 +98,7 @@ __attribute__((target("default"), flatten))
 static void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into, int next) {
   multiply_by<2>(a, matrix, rows, n, m, into, next);
 }
+
 inline void multiply(const double* a, const double* matrix, int rows, int n, int m, double* into) {
   multiply(a, matrix, rows, n, m, into, n);
 }
@@ -188,8 +189,8 @@ class ActiveSet {
   void gaps(const double* F, const double* q, const double* lam, bool symmetric, int n) {
     w_.assign(q, q + n);
     for (int i = 0; i < n; i++) {
+      if (symmetric && lam[i] != 0) add(lam[i], F + i * n, n, w_.data());
       if (!symmetric) w_[i] += dot(F + i * n, lam, n);
-      else if (lam[i] != 0) add(lam[i], F + i * n, n, w_.data());
     }
   }
 
