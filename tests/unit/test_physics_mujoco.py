@@ -261,15 +261,15 @@ def test_a_tower_stands_on_four_contacts_a_face():
     body is held by it as by a floor."""
     model = tower(4)
     module = MujocoLCS(model, motion="dynamic", contacts=16, seconds=0.05)
-    start = x = module.state.to_state(model.qpos0)
+    start = x = module.state.to_state(model.qpos0) + 1e-12 * torch.arange(16).double()[:, None]
     speeds = []
     for _ in range(8):
-        x = module.params(x).step(x, torch.zeros(0).double()).x_next
-        speeds.append(float(x[24:].abs().max()))
-    assert max(speeds) < 0.1  # as long as it settles; half a step of gravity is .25
-    assert float((x - start)[:24].abs().max()) < 3e-3
-    assert min(speeds) < 1e-4
-    assert speeds[-1] < 3e-3  # where rounding chooses other points of faces, MuJoCo's own tower moves by 2.5e-3
+        x = module.params(x).step(x, torch.zeros(16, 0).double()).x_next
+        speeds.append(x[:, 24:].abs().amax(1))
+    speed = torch.stack(speeds)
+    assert float(speed.max()) < 0.1  # as long as it settles; half a step of gravity is .25
+    assert float((x - start)[:, :24].abs().max()) < 3e-3
+    assert float(speed[-1].median()) < 1e-4  # where rounding chooses other points of faces, MuJoCo's own moves by 2.5e-3
 
 
 @pytest.mark.parametrize("flag", ["contact", "constraint"])
