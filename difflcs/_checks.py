@@ -266,11 +266,8 @@ def check_positive_definite(F: Tensor) -> None:
 
 def batch_index(shape: Sequence[int], flat: int) -> str:
     """Write a flat index as the index of a batch element: 3, or (1, 0)."""
-    index = []
-    for size in reversed(shape):
-        flat, i = divmod(flat, size)
-        index.insert(0, i)
-    return str(index[0]) if len(index) == 1 else str(tuple(index))
+    index = tuple(map(int, np.unravel_index(flat, shape)))
+    return str(index[0]) if len(index) == 1 else str(index)
 
 
 def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:

@@ -92,9 +92,10 @@ def test_a_goal_cost_has_one_dtype():
 
 
 def test_semidefinite_weights_are_accepted():
-    zero = torch.zeros(3, 3, dtype=torch.float64)
-    ones = torch.ones(3, 3, dtype=torch.float64)  # rank one, eigenvalues rounded around zero
-    QuadraticCost(ones, torch.eye(2).double(), zero)
+    eye, ones = torch.eye(2, dtype=torch.float64), torch.ones(3, 3, dtype=torch.float64)
+    QuadraticCost(ones, eye, 0 * ones)  # rank one, eigenvalues rounded around zero
+    QuadraticCost(eye, eye, eye, S=eye)  # ‖x + u‖², whose Hessian is singular
+    refuse(InvalidInputError, r"smallest eigenvalue -1\.000e-06", QuadraticCost, eye, eye, eye, S=(1 + 1e-6) * eye)
 
 
 # --- cross terms ----------------------------------------------------------------------------------------------------
@@ -124,13 +125,6 @@ def test_cross_terms_that_make_the_cost_indefinite_are_refused(build, batch):
     cost.S.data.mul_(30)  # as an optimiser does
     mpc = LCSMPCLayer(build.params(), cost, 3, -1.0, 1.0)
     refuse(InvalidInputError, r"\[\[Q, S\], \[Sᵀ, R\]\]: expected", mpc, torch.zeros(*batch, 4).double())
-
-
-def test_semidefinite_weights_with_cross_terms_are_accepted():
-    """‖x + u‖², whose Hessian is singular."""
-    eye = torch.eye(2, dtype=torch.float64)
-    QuadraticCost(eye, eye, eye, S=eye)
-    refuse(InvalidInputError, r"smallest eigenvalue -1\.000e-06", QuadraticCost, eye, eye, eye, S=(1 + 1e-6) * eye)
 
 
 # --- references ---------------------------------------------------------------------------------------------------
