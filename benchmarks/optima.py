@@ -7,7 +7,6 @@ first one by one.
 """
 
 import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import torch
 import tyro
 from bouncing import FAMILIES as BOUNCING
 from models import FAMILIES, Instance
+from rivals.run import cpu
 
 from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save, smoke_path
@@ -53,9 +53,7 @@ def solve(instance: Instance, backend: Backend) -> tuple[torch.Tensor, float]:
     """Solve; return the objective of each problem, infinite where it failed, and CPU seconds."""
     mpc = LCSMPCLayer(backend=backend, on_failure="mask", **instance.layer)
     with torch.no_grad():
-        started = time.process_time()
-        plan = mpc(*instance.call)
-        seconds = time.process_time() - started
+        seconds, plan = cpu(mpc, *instance.call)
     return torch.where(plan.converged, plan.objective, torch.inf), seconds
 
 
@@ -69,9 +67,7 @@ def time_alone(instance: Instance, repetitions: int) -> dict[str, float]:
             taken = {name: [] for name in EFFORTS}
             for _ in range(repetitions):
                 for name, backend in EFFORTS.items():
-                    started = time.process_time()
-                    backend.solve(problem, None)
-                    taken[name].append(time.process_time() - started)
+                    taken[name].append(cpu(backend.solve, problem, None)[0])
             for name, times in taken.items():
                 seconds[name] += min(times)
     return seconds

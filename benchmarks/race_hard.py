@@ -87,7 +87,7 @@ def closed_loop(rival: Any, few: int) -> tuple[float, np.ndarray]:
         data, x = problem.only(i), problem.x0[i].copy()
         start = x
         for _ in range(STEPS):
-            seconds, u = cpu(lambda i=i, x=x: rival.step(i, x))
+            seconds, u = cpu(rival.step, i, x)
             cost, x = execute(data, x, u[None])
             costs[i] += cost
             times.append(seconds)
@@ -147,7 +147,7 @@ def measure(problems: int, seeds: int, rounds: int, only: tuple[str, ...] = ()) 
             times = {label: np.full(problems, np.inf) for label in planners}
             for _ in range(rounds + 1):  # the first is set-up
                 for label, solver in solvers.items():
-                    solved = [cpu(lambda i=i, solver=solver: solver.one(i)) for i in range(problems)]
+                    solved = [cpu(solver.one, i) for i in range(problems)]
                     times[label] = np.minimum(times[label], [seconds for seconds, _ in solved])
                     found[label] = objectives(problem, np.concatenate([answer.u for _, answer in solved]))
             best = np.minimum(np.min([*found.values()], axis=0), reference(problem))

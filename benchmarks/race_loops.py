@@ -104,8 +104,7 @@ class Planner(Backend):
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Plan for each problem; the states of a rival's plan are those that its actions cause."""
         if self.ours is not None:
-            solve = self.ours.solve
-            seconds, result = cpu(lambda: solve(problem, guess))
+            seconds, result = cpu(self.ours.solve, problem, guess)
             self.seconds[1] += seconds
             self.met.append((problem, result.primal.u))
             return result

@@ -12,7 +12,6 @@ Printed per size: the share of problems solved, iterations of one start on avera
 CPU time per problem. Written as JSON too. `--hand 4` prints times of plans of a hand instead.
 """
 
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ import numpy as np
 import torch
 import tyro
 from models import Instance, chain, chain_of_carts, pushing, pushing_model, random_model, to_rest
+from rivals.run import cpu
 
 from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save, smoke_path
@@ -72,11 +72,9 @@ class Options:
 @torch.no_grad()
 def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]:
     """Solve problems of one size by one backend, print a line, and give the figures; times are seconds of CPU."""
-    backend, plans = BACKENDS[name], []
-    begun = time.process_time()
-    for instance in instances:
-        plans.append(LCSMPCLayer(backend=backend, on_failure="mask", **instance.layer)(*instance.call))
-    spent = time.process_time() - begun
+    backend = BACKENDS[name]
+    options = {"backend": backend, "on_failure": "mask"}
+    spent, plans = cpu(lambda: [LCSMPCLayer(**options, **instance.layer)(*instance.call) for instance in instances])
     solved, iterations = (torch.cat([getattr(p, n) for p in plans]).double() for n in ("converged", "iterations"))
     problem = plans[0].problem
     size = backend.starts(problem, guessed=False) if isinstance(backend, BatchedBackend) else None
@@ -117,9 +115,7 @@ def time_hand(loops: int, limits: int | None, each: int, palm: int) -> None:
         for part in torch.arange(len(x)).split(len(x) if batch else 1):
             asked = replace(problem.select(part), relaxation=relaxation)
             guess = Primal(*(v[part] for v in last), x.new_zeros(len(part), 5, 0)) if warm else None
-            begun = time.process_time()
-            backend.solve(asked, guess)
-            ms.append(1e3 * (time.process_time() - begun) / len(part))
+            ms.append(1e3 * cpu(backend.solve, asked, guess)[0] / len(part))
         print(f"{asked.n_lam} forces, {name}: mean {np.mean(ms):.2f}, median {np.median(ms):.2f}, most {max(ms):.1f}")
 
 

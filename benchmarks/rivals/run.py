@@ -27,10 +27,10 @@ def package() -> None:
     spec.loader.exec_module(module)
 
 
-def cpu(work: Callable[[], Any]) -> tuple[float, Any]:
+def cpu(work: Callable[..., Any], *given: Any) -> tuple[float, Any]:
     """Do some work; return CPU seconds of all threads, and its result."""
     start = time.process_time()
-    result = work()
+    result = work(*given)
     return time.process_time() - start, result
 
 
@@ -58,7 +58,7 @@ def race(name: str, settings: dict, job: dict) -> dict:
     for i in range(min(problem.count, job["few"])):
         if i >= 2 and time.process_time() - began > job["seconds"]:
             break
-        seconds, answer = cpu(lambda i=i: rival.one(i))
+        seconds, answer = cpu(rival.one, i)
         plans.append(answer.u[0])
         solved.append(bool(answer.solved[0]))
         times.append(seconds)
