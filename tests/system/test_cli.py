@@ -16,6 +16,7 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -227,10 +228,7 @@ def test_who_reads_the_output_may_stop(words):
 
 
 def test_ctrl_c_while_the_command_is_imported(capsys, monkeypatch):
-    def die(_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "main", die)
+    monkeypatch.setattr(cli, "main", Mock(side_effect=KeyboardInterrupt))
     assert __main__.main(["train"]) == 130
     assert capsys.readouterr().err == "\ndifflcs: interrupted; nothing was changed\n"
 
@@ -318,11 +316,7 @@ def test_assets_download(capsys, tmp_path, monkeypatch):
     assert run(capsys, "assets", "download")[0] == 0
     assert f"DIFFLCS_YCB_DIR={tmp_path}" in passes(capsys, "assets", "download", "mug", "clamp", "--folder", tmp_path)
     assert calls == [(None, None), (("mug", "clamp"), tmp_path)]
-
-    def fail(*_, **__):
-        raise AssetError("no network")
-
-    monkeypatch.setattr(assets, "download", fail)
+    monkeypatch.setattr(assets, "download", Mock(side_effect=AssetError("no network")))
     assert fails(capsys, "assets", "download") == "difflcs: no network\n"
 
 
@@ -354,7 +348,7 @@ def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monke
         assert message in fails(capsys, "train", *short, *arguments)
         assert contents(path) == before
     with monkeypatch.context() as patch:  # interrupted before it begins
-        patch.setattr("difflcs.rl.methods.ViolationMethod.trainer", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("difflcs.rl.methods.ViolationMethod.trainer", Mock(side_effect=KeyboardInterrupt))
         assert run(capsys, "train", *short, "--seed", 1)[0] == 130
     assert contents(path) == before
     assert run(capsys, "train", *short, "--seed", 1)[0] == 0
@@ -398,12 +392,8 @@ def test_bench(capsys):
 def test_an_interrupted_training_says_how_to_go_on(capsys, finished, tmp_path, monkeypatch):
     """Interrupted before the final model; after any iteration: tests/conformance/test_methods.py."""
     path = tmp_path / "run"
-
-    def die(*_, **__):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr("difflcs.lcs.LCSModel.save_pretrained", die)
+        patch.setattr("difflcs.lcs.LCSModel.save_pretrained", Mock(side_effect=KeyboardInterrupt))
         code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err

@@ -3,6 +3,7 @@
 import json
 import re
 from importlib import metadata
+from unittest.mock import Mock
 
 import pytest
 
@@ -74,11 +75,8 @@ def test_text_and_json(checks, capsys, monkeypatch):
 
 @pytest.mark.parametrize("error", [RuntimeError("no such instruction set"), ImportError("libc"), ValueError()])
 def test_a_broken_core_is_exit_code_1(capsys, monkeypatch, versions, error):
-    def fail(*_):
-        raise error
-
     versions.update(mujoco=None)  # the environments are not tried
-    monkeypatch.setattr(doctor, "solve_lcp", fail)
+    monkeypatch.setattr(doctor, "solve_lcp", Mock(side_effect=error))
     monkeypatch.setenv("COLUMNS", "68")  # where the remedy would break at a hyphen
     assert cli.main(["doctor"]) == 1
     text = capsys.readouterr().out

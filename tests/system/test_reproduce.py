@@ -10,6 +10,7 @@ import threading
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import ablations
 import dask
@@ -369,10 +370,7 @@ def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatc
 
 
 def test_ctrl_c_says_how_to_go_on(monkeypatch, tmp_path, capsys):
-    def interrupt(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(runs, "compute", interrupt)
+    monkeypatch.setattr(runs, "compute", Mock(side_effect=KeyboardInterrupt))
     monkeypatch.setattr(runs, "connect", lambda *arguments: contextlib.nullcontext())
     code, _, err = run_script(run_runs, capsys, "--methods", "pddm", "--work", tmp_path, "--results", tmp_path)
     assert code == 130

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -58,12 +59,8 @@ def test_round_trip_and_pruning(tmp_path):
 @pytest.mark.parametrize("step", ["save_record", "write_json"])
 def test_a_crash_leaves_the_previous_checkpoint(tmp_path, monkeypatch, step):
     save(tmp_path, 1)
-
-    def die(*_):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(_storage, step, die)  # while writing, or between writing and switching
+        patch.setattr(_storage, step, Mock(side_effect=KeyboardInterrupt))  # while writing, or between writing and switching
         with pytest.raises(KeyboardInterrupt):
             save(tmp_path, 2)
     assert_equal(load_checkpoint(tmp_path), 1)
@@ -390,11 +387,7 @@ def test_what_is_no_model_is_refused_by_its_directory_and_untouched(saved, match
 def test_an_interrupt_during_a_write_leaves_the_old_file(tmp_path, monkeypatch, interrupt):
     path = tmp_path / "file"
     _storage.write_atomically(path, b"old")
-
-    def fail(*args):
-        raise interrupt
-
-    monkeypatch.setattr(os, "fsync", fail)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=interrupt))
     with pytest.raises(interrupt):
         _storage.write_atomically(path, b"new")
     assert contents(tmp_path) == {"file": b"old"}

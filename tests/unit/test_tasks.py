@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -42,11 +43,8 @@ def test_an_environment_of_an_id():
 
 
 def test_environments_that_cannot_be_made_say_why():
-    def broken(**_):
-        raise RuntimeError("no light")
-
     for task, why in (
-        (make_task(env=broken), "RuntimeError: no light"),
+        (make_task(env=Mock(side_effect=RuntimeError("no light"))), "RuntimeError: no light"),
         (make_task(env="nowhere/None-v0"), "nowhere"),
         (make_task(env="no_such_module:None-v0"), "no_such_module"),
         (make_task(env_kwargs={"color": "red"}), "color"),
