@@ -13,6 +13,7 @@ if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, str(max(1, (os.cpu_count() or 1) // workers)))
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -52,6 +53,14 @@ def python(*arguments: str | Path, fails: bool = False, **options: Any) -> subpr
 
 def tensor(values: Sequence[Any] | float) -> Tensor:
     return torch.tensor(values, dtype=F64)
+
+
+def linear_system(A: Any, B: Any, d: Any = None, **contacts: Any) -> LCSParams:
+    """x₊ = A x + B u + d, without contacts where none are given."""
+    n, m = np.shape(B)
+    sizes = {"d": n, "C": (n, 0), "D": (0, n), "E": (0, m), "F": (0, 0), "c": 0}
+    given = contacts if d is None else {"d": d, **contacts}
+    return LCSParams(A, B, **{**{name: np.zeros(size) for name, size in sizes.items()}, **given})
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:

@@ -20,6 +20,7 @@ from difflcs.mpc.backends import get_backend
 from tests.conformance import judges, problems
 from tests.conformance.differences import compare, moves, weigh
 from tests.conformance.problems import BOUNDS, COST, INF, LCS, PROBLEMS, STAGED, make, solve
+from tests.conftest import linear_system
 
 BACKENDS = available_backends()
 EXACT = tuple(name for name in BACKENDS if get_backend(name).exact)
@@ -196,8 +197,7 @@ def test_a_weakly_active_bound_is_degenerate_and_has_the_gradient_of_one_side(bu
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_kink_of_an_action_with_one_bound_at_zero_is_degenerate(backend, side):
     """An action that rests at its only bound in all steps has no size by which to say how near a kink is."""
-    one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
-    lcs = LCSParams(A=one, B=side * one, C=none, d=0 * one[0], D=none.mT, E=none.mT, F=none.mT @ none, c=none[0])
+    lcs, one = linear_system([[1.0]], [[side]]), torch.ones(1, 1, dtype=torch.float64)
     mpc = LCSMPCLayer(lcs, QuadraticCost(Q=one, R=0.1 * one, Q_final=one), 4, 0 * one[0], math.inf, backend=backend)
     x0 = torch.tensor([[0.0], [0.5 * side], [-0.5 * side]], dtype=torch.float64, requires_grad=True)
     with pytest.warns(DegenerateWarning, match="1 of 3 solutions"):

@@ -5,26 +5,14 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from difflcs import ConstraintSequence, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
+from difflcs import ConstraintSequence, LCSMPCLayer, LinearConstraints, QuadraticCost, Status
 from difflcs.errors import SolveWarning
 from difflcs.mpc import Primal, kkt
+from tests.conftest import linear_system as system
 from tests.conftest import tensor
 
 INF = float("inf")
 EXACT = pytest.mark.parametrize("backend", ["batched", "ipopt"])
-
-
-def system(A, B, **contact) -> LCSParams:
-    A, B = tensor(A), tensor(B)
-    n, m = B.shape
-    none = {
-        "C": np.zeros((n, 0)),
-        "D": np.zeros((0, n)),
-        "E": np.zeros((0, m)),
-        "F": np.zeros((0, 0)),
-        "c": np.zeros(0),
-    }
-    return LCSParams(A=A, B=B, d=torch.zeros(n).double(), **{k: tensor(v) for k, v in {**none, **contact}.items()})
 
 
 def cost(n, m, Q=None, R=None, **linear) -> QuadraticCost:

@@ -60,7 +60,7 @@ def test_round_trip_and_pruning(tmp_path):
 def test_a_crash_leaves_the_previous_checkpoint(tmp_path, monkeypatch, step):
     save(tmp_path, 1)
     with monkeypatch.context() as patch:
-        patch.setattr(_storage, step, Mock(side_effect=KeyboardInterrupt))  # while writing, or between writing and switching
+        patch.setattr(_storage, step, Mock(side_effect=KeyboardInterrupt))  # while writing, or before switching
         with pytest.raises(KeyboardInterrupt):
             save(tmp_path, 2)
     assert_equal(load_checkpoint(tmp_path), 1)

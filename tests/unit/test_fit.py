@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSParams, Transitions, fit_report
+from difflcs import LCSModel, Transitions, fit_report
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.systems import cart_pole_between_walls
-from tests.conftest import refuse
+from tests.conftest import linear_system, refuse
 
 
 def play(system, count=12, length=15, seed=0):
@@ -37,15 +37,7 @@ def test_the_system_that_made_the_data_has_no_error_and_needs_every_contact():
 
 def test_a_system_without_contacts_is_judged_beside_the_affine_one():
     truth, data = cart_pole_between_walls(), play(cart_pole_between_walls())
-    values = truth.tensors()
-    empty = {
-        "C": torch.zeros(4, 0),
-        "D": torch.zeros(0, 4),
-        "E": torch.zeros(0, 1),
-        "F": torch.zeros(0, 0),
-        "c": torch.zeros(0),
-    }
-    report = fit_report(LCSParams(**{**values, **{k: v.double() for k, v in empty.items()}}), *data)
+    report = fit_report(linear_system(truth.A, truth.B, truth.d), *data)
     assert report.gain.shape == (len(data.x), 0)
     assert (report.linear <= report.error + 1e-12).all()  # least squares on these very data
     still = (data.x_next - data.x).square().mean(0).sqrt()

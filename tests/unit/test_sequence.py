@@ -4,11 +4,11 @@ import mujoco
 import pytest
 import torch
 
-from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost, sequence_along
+from difflcs import GoalCost, LCSMPCLayer, LCSSequence, QuadraticCost, sequence_along
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position
-from tests.conftest import refuse, tensor
+from tests.conftest import linear_system, refuse, tensor
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>
@@ -129,8 +129,7 @@ class Drift:
         self.kind = kind
 
     def params(self, x=None, context=None):
-        one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
-        return self.kind(LCSParams(one, one, none, context, none.mT, none.mT, none.mT @ none, none[0]))
+        return self.kind(linear_system([[1.0]], [[1.0]], context))
 
 
 def test_a_context_holds_for_all_stages():
