@@ -17,7 +17,6 @@ machine mean little, ratios more. Then the price of a deadline: the cube's error
 does, and the share of steps not solved.
 """
 
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ import numpy as np
 import torch
 import tyro
 from models import diagonal, uniform
+from rivals.run import cpu
 from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
@@ -145,9 +145,7 @@ def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
         plan = steps[-1].plan
         for name, way in ways.items():
             for step in steps:
-                begun = time.process_time_ns()
-                way(step)
-                used = 1e-9 * (time.process_time_ns() - begun)
+                used, _ = cpu(way, step)
                 if episode < 0:
                     continue
                 seconds[name].append(used)
