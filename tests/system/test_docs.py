@@ -43,8 +43,6 @@ def name(page: Path) -> str:
 @pytest.fixture(scope="module")
 def generated():
     spec = importlib.util.spec_from_file_location("docs_generated", DOCS / "generated.py")
-    assert spec
-    assert spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

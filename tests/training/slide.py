@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import torch
@@ -138,22 +139,10 @@ def make_models(seed: int = 0, first_epochs: int = 20, **changes: Any) -> ModelR
     return ModelRollouts(make_envs(), outcome, settings, seed, STEPS)
 
 
-class Recording:
-    """A part of a trainer that notes what it was called with and what it gave."""
-
-    def __init__(self, part: Any):
-        self.part, self.calls, self.results = part, [], []
-
-    def __call__(self, *arguments: Any) -> Any:
-        self.calls.append(arguments)
-        self.results.append(self.part(*arguments))
-        return self.results[-1]
-
-
-def recorded(trainer: PPO, source: str = "robot") -> Recording:
+def recorded(trainer: PPO, source: str = "robot") -> Mock:
     """Note what the advantages of a trainer are asked for: (episodes, inputs, rewards, key) → `Estimate`."""
     part = getattr(trainer, source)
-    recording = Recording(part.advantages)
+    recording = Mock(wraps=part.advantages)
     setattr(trainer, source, replace(part, advantages=recording))
     return recording
 

@@ -67,7 +67,7 @@ def test_the_policy_explores_and_the_environment_gets_actions_clipped_into_the_b
     trainer = slide.make_ppo(std=0.2, controller=slide.make_mpc(slide.make_model(), most))
     seen = slide.recorded(trainer)
     trainer.step()
-    episodes = seen.calls[0][0]
+    episodes = seen.call_args.args[0]
     data = episodes["policy"]
     noise = (data["action"] - data["loc"]).flatten()
     assert float(noise.std()) == pytest.approx(0.2, rel=0.2)
@@ -79,7 +79,7 @@ def test_rewards_are_limited_and_end_with_the_penalty():
     trainer = slide.make_ppo(cost_limit=1.0, penalty=7.0, reward_scale=0.5, std=0.1)
     seen = slide.recorded(trainer)
     report = trainer.step()
-    episodes, _, rewards, _ = seen.calls[0]
+    episodes, _, rewards, _ = seen.call_args.args
     raw = -20 * (episodes["state"][:, :-1] - episodes["goal"].unsqueeze(1)).abs().squeeze(-1)
     expected = 0.5 * raw.clamp_min(-1.0)
     expected[:, -1] -= 0.5 * 7.0 * (~episodes["success"]).double()
@@ -93,15 +93,15 @@ def test_rewards_are_limited_and_end_with_the_penalty():
 def test_policy_and_value_network_see_the_same_time():
     """`elapsed_fractions`, bit for bit: while acting, in the value network, and in what networks foresee."""
     trainer = slide.make_ppo(models=slide.make_models(iterations=1, actions=4))
-    seen, times = [slide.recorded(trainer, "robot"), slide.recorded(trainer, "practice")], []
-    judge, plain = seen[1].part, seen[1].part.features
+    judge, plain, times = trainer.practice.advantages, trainer.practice.advantages.features, []
+    seen = [slide.recorded(trainer, "robot"), slide.recorded(trainer, "practice")]
     judge.features = lambda state, goal, elapsed: (times.append(elapsed), plain(state, goal, elapsed))[1]
     for _ in range(2):
         trainer.step()
     elapsed = elapsed_fractions(slide.STEPS)
     assert torch.equal(elapsed, torch.linspace(0, 1, slide.STEPS + 1, dtype=torch.float64))
     for recording in seen:
-        for episodes, inputs, _, _ in recording.calls:
+        for (episodes, inputs, _, _), _ in recording.call_args_list:
             count = len(episodes)
             assert torch.equal(episodes["policy", "elapsed"], elapsed[:-1].expand(count, -1))
             assert torch.equal(inputs[..., -1], elapsed.expand(count, -1))
@@ -126,7 +126,7 @@ def test_minibatches(size, sizes):
     batches = solved[slide.STEPS :]  # the first ones are those of the episodes in lockstep
     assert [len(batch) for batch in batches] == sizes
     states = torch.cat([batch["state"] for batch in batches]).sort(0).values[:: 3 if sizes[0] == 72 else 1]
-    data = seen.calls[0][0]["policy"].flatten(0, 1)
+    data = seen.call_args.args[0]["policy"].flatten(0, 1)
     torch.testing.assert_close(states, data["state"].sort(0).values, rtol=0, atol=0)
     for batch in batches:  # a guess belongs to its state
         torch.testing.assert_close(batch["guess", "x"][:, 0], batch["state"], rtol=0, atol=1e-9)
@@ -216,9 +216,9 @@ def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, last
         trainer.remember(collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2, 3], slide.STEPS))
     seen = slide.recorded(trainer, "practice")
     while not trainer.done:
-        before = len(seen.calls)
+        before = seen.call_count
         report = trainer.step()
-        counts.append(len(seen.calls) - before)
+        counts.append(seen.call_count - before)
         assert (report.model_success is None) == (report.model_loss is None) == (counts[-1] == 0)
     assert counts == expected
 
@@ -281,14 +281,20 @@ def test_iterations_on_model_rollouts_have_an_effort_of_their_own():
 def test_the_value_network_learns_from_what_the_estimator_says(actions):
     """From rewards without the action advantage in model rollouts, from real ones as they are."""
     trainer = make_practising(models={"iterations": 1, "actions": actions})
-    seen = [slide.recorded(trainer, "robot"), slide.recorded(trainer, "practice")]
+    judge, judged, seen = trainer.practice.advantages, [], slide.recorded(trainer)
+
+    def noted(episodes, inputs, rewards, key):
+        judged.append((rewards, judge(episodes, inputs, rewards, key)))
+        return judged[-1][1]
+
+    trainer.practice = replace(trainer.practice, advantages=noted)
     for _ in range(2):
         trainer.step()
-    (_, _, rewards, _), estimate = seen[1].calls[0], seen[1].results[0]
+    rewards, estimate = judged[0]
     assert estimate.samples.batch_size == (10, slide.STEPS, actions)
     torch.testing.assert_close(trainer.critic.history[1][1], estimate.rewards, rtol=0, atol=0)
     assert torch.equal(estimate.rewards, rewards) == (actions == 1)
-    assert torch.equal(trainer.critic.history[2][1], seen[0].calls[1][2])
+    assert torch.equal(trainer.critic.history[2][1], seen.call_args.args[2])
 
 
 def test_a_state_without_models_is_refused():

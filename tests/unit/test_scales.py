@@ -1,6 +1,7 @@
 """Units suggested from data: the same whatever the units of the data, and a model learns as well in any."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -102,20 +103,15 @@ def test_a_state_dict_of_another_system_with_the_same_parameters_is_refused(data
 
 
 def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
-    scales, seen = suggest_scales(*data), []
-
-    class Asked(LCSModel):
-        def params(self, x=None, context=None):
-            seen.append((x, context))
-            return super().params()
-
-    scaled = ScaledLCS(Asked(4, 2, 3), scales)
-    context = torch.ones(2)
+    scales, lcs, context = suggest_scales(*data), LCSModel(4, 2, 3), torch.ones(2)
+    lcs.params = Mock(wraps=lcs.params)
+    scaled = ScaledLCS(lcs, scales)
     scaled.params(data[0], context)
     scaled.params()
-    torch.testing.assert_close(seen[0][0], scales.normalise(*data)[0])
-    assert seen[0][1] is context
-    assert seen[1] == (None, None)
+    (x, given), nothing = (call.args for call in lcs.params.call_args_list)
+    torch.testing.assert_close(x, scales.normalise(*data)[0])
+    assert given is context
+    assert nothing == (None, None)
 
 
 @pytest.mark.parametrize("name", ["x", "u", "x_next"])

@@ -133,13 +133,10 @@ def _lcp(problem: LCP, relaxation: float, dtype) -> Outcome:
     ratios = checks.judge_lcp(wide, _numpy(judged.lam), _numpy(judged.w), relaxation)
     ratios["finite"] = checks.finite(_numpy(solution.lam), _numpy(solution.w))
     ratios["rounding"] = _rounding((solution.lam, judged.lam), (solution.w, judged.w))
-    F_grad, q_grad = F.grad, q.grad
-    assert F_grad is not None
-    assert q_grad is not None
-    gradient = checks.finite(q_grad.numpy())
+    gradient = checks.finite(q.grad.numpy())
     if F.ndim == 3:
-        gradient = np.maximum(gradient, checks.finite(F_grad.numpy()))
-    elif not bool(torch.isfinite(F_grad).all()) and not gradient.any():
+        gradient = np.maximum(gradient, checks.finite(F.grad.numpy()))
+    elif not bool(torch.isfinite(F.grad).all()) and not gradient.any():
         gradient = _who(lambda part: part.each(), lambda part: _lcp(part, relaxation, dtype), problem)
     ratios["finite gradient"] = gradient
     return Outcome(status, promised(ratios, status == Status.CONVERGED))
@@ -177,8 +174,6 @@ def _lcp_differences(problem: LCP, relaxation: float, rng: Generator) -> tuple[n
         units = [np.abs(lam).max(-1, keepdims=True), np.abs(np.concatenate([w, problem.q], -1)).max(-1, keepdims=True)]
         seeds = [torch.from_numpy(a / np.maximum(b, 1e-300)) for a, b in zip(weights, units, strict=True)]
         torch.autograd.backward([solution.lam, solution.w], seeds)
-        assert F.grad is not None
-        assert q.grad is not None
         direction = (dF[:, :, None] + dF[:, None]) * problem.F
         terms = np.concatenate([(F.grad.numpy() * direction).reshape(count, -1), q.grad.numpy() * problem.q * dq], 1)
 
@@ -480,7 +475,6 @@ def _loss_differences(problem: Loss, rng: Generator) -> tuple[np.ndarray, int]:
     gradients = {k: p.grad.numpy() for k, p in model.named_parameters() if p.grad is not None}
     terms = [(g * draws[k] * problem.system[k]).ravel() for k, g in gradients.items()]
     for name, leaf in zip(data, tensors, strict=True):
-        assert leaf.grad is not None
         terms.append((leaf.grad.numpy() * data[name] * getattr(problem, name)).ravel())
 
     def difference(step: float) -> tuple[np.ndarray, np.ndarray]:
