@@ -273,7 +273,7 @@ def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
         assert not out.exists()
 
 
-def test_only_what_learned_a_model_gives_one(name, finished):
+def test_only_what_learned_a_model_gives_one_and_a_policy_only_of_its_sizes(name, finished):
     run = finished(name)
     if make_config(name).method.takes_init:
         model = load_model(run.path)
@@ -282,10 +282,7 @@ def test_only_what_learned_a_model_gives_one(name, finished):
     else:
         for path in (run.path, run.model):
             refuse(CheckpointError, ".", load_model, path)
-
-
-def test_what_was_learned_of_other_sizes_is_refused(name, finished):
-    refuse(CheckpointError, "expected", load_policy, finished(name), make_task(size=3))
+    refuse(CheckpointError, "expected", load_policy, run, make_task(size=3))
 
 
 # --- evaluation -------------------------------------------------------------------------------------------------------

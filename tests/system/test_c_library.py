@@ -24,6 +24,7 @@ from difflcs.physics import BodyFrameLCS
 from difflcs.rl import TrainedPolicy
 from difflcs.rl.tasks import get_task, single_start_backend
 from difflcs.systems import pushing_cost
+from tests.conftest import refuse
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("cmake", "cc", "c++")
@@ -246,11 +247,9 @@ def test_layers_are_exported_too(build, tmp_path):
     assert described["step_seconds"] == 0.02
     u = MPCController.load(path).step(np.full(4, 0.1))
     assert np.array_equal(u, mpc.controller().step(np.full(4, 0.1)))
-    with pytest.raises(InvalidInputError, match="expected an LCSMPCLayer"):
-        export_controller(mpc.lcs, tmp_path)
+    refuse(InvalidInputError, "expected an LCSMPCLayer", export_controller, mpc.lcs, tmp_path)
     for about in ({"offset": np.zeros(3)}, {"offset": np.nan}, "mine"):
         with pytest.raises(InvalidInputError, match="about: expected finite values in JSON types"):
             export_controller(mpc, tmp_path, about=about)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match="expected a place to write"):
-        export_controller(mpc, tmp_path / "file")
+    refuse(InvalidInputError, "expected a place to write", export_controller, mpc, tmp_path / "file")

@@ -298,7 +298,7 @@ def bound(name):
 
 
 @pytest.mark.parametrize("name", ["u_min", "u_max"])
-def test_layer_refuses_bounds_that_are_nan_or_allow_nothing(build, name):
+def test_layer_refuses_bounds_that_are_nan_or_allow_nothing_or_no_barrier(build, name):
     x0, mpc = torch.zeros(4, dtype=torch.float64), layer(build, u_min=None, u_max=None)
     broken, nowhere = spoil(bound(name), NAN), INF if name == "u_min" else -INF
     for function in (lambda v: layer(build, **{"u_min": None, "u_max": None, name: v}), lambda v: mpc(x0, **{name: v})):
@@ -310,10 +310,6 @@ def test_layer_refuses_bounds_that_are_nan_or_allow_nothing(build, name):
     with torch.no_grad():
         learned[1] = NAN
     refuse(e.NonFiniteError, f"{name}: expected numbers or infinity, got 1 NaN", mpc, x0)
-
-
-@pytest.mark.parametrize("name", ["u_min", "u_max"])
-def test_a_barrier_refuses_bounds_that_are_infinite(build, name):
     refuse(e.BoundsError, "expected finite bounds with a barrier.*barrier=0", layer, build, barrier=0.1, **{name: None})
 
 

@@ -429,11 +429,6 @@ def test_arguments_that_do_not_fit(reaching, arguments, error, message):
     assert np.array_equal(controller.plan.u, before.u)
 
 
-def test_goals_without_a_goal_cost(plain):
-    refuse(ShapeError, "goal: expected none", plain.controller().step, np.zeros(4), np.zeros(2))
-    refuse(ShapeError, "reference: expected none", plain.controller().step, np.zeros(4), reference=np.zeros((H + 1, 2)))
-
-
 class Curved(GoalCost):
     """Not linear in the goal."""
 
@@ -441,8 +436,10 @@ class Curved(GoalCost):
         return super().at(goal**2, horizon)
 
 
-def test_layers_and_options_that_it_does_not_take(build, plain):
+def test_goals_options_and_layers_that_it_does_not_take(build, plain):
     params, cost = build.params(0), build.cost(0)
+    refuse(ShapeError, "goal: expected none", plain.controller().step, np.zeros(4), np.zeros(2))
+    refuse(ShapeError, "reference: expected none", plain.controller().step, np.zeros(4), reference=np.zeros((H + 1, 2)))
     refuse(InvalidInputError, "on_failure: expected 'hold'", plain.controller, on_failure="stop")
     refuse(ShapeError, "on_failure: expected shape", plain.controller, on_failure=np.zeros(3))
     refuse(NonFiniteError, "on_failure", plain.controller, on_failure=[np.nan, 0.0])

@@ -153,11 +153,6 @@ def test_there_are_as_many_rest_poses_as_stable_faces():
     assert len(meshes.rest_poses(needle, np.zeros(3))) == 2  # on edge it falls over
 
 
-def test_unknown_rest_pose(stl):
-    with pytest.raises(ValueError, match=r"stable poses of thing.stl.*0: 15.0 mm.*got 9"):
-        make(stl(trimesh.creation.box((0.06, 0.04, 0.03))), rest_pose=9)
-
-
 @pytest.mark.slow
 def test_parts_are_cached_and_a_damaged_cache_is_mended(stl, tmp_path, monkeypatch):
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "cache"))
@@ -281,10 +276,11 @@ def test_bad_arguments(arguments, message):
     refuse(ValueError, message, make, **arguments)
 
 
-def test_true_mass_needs_a_published_one(stl):
+def test_what_an_own_mesh_does_not_have_is_refused(stl):
     path = stl(trimesh.creation.box((0.06, 0.04, 0.03)))
     refuse(ValueError, "no mass is published", make, path, object_mass="true")
     refuse(ValueError, "Only YCB objects", make, path, object_source="stand_in")
+    refuse(ValueError, r"stable poses of thing.stl.*0: 15.0 mm.*got 9", make, path, rest_pose=9)
 
 
 @pytest.mark.parametrize("name", ["extra_large_clamp", "wrench", "banana"])

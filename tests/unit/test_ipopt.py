@@ -174,11 +174,9 @@ def test_a_backend_whose_package_is_missing_gives_the_pip_line(build):
 
     register_backend(Absent)
     assert "absent" not in available_backends()
+    said = r"'absent'.*'no_such_package_for_difflcs' is not.*pip install 'mine\[solver\]'"
     for backend in ("absent", Absent()):
-        with pytest.raises(
-            BackendNotFoundError, match=r"'absent'.*'no_such_package_for_difflcs' is not.*pip install 'mine\[solver\]'"
-        ):
-            make_layer(build, backend=backend)
+        refuse(BackendNotFoundError, said, make_layer, build, backend=backend)
 
 
 @pytest.mark.parametrize("backend", [None, 3, IpoptBackend])

@@ -40,14 +40,11 @@ def test_from_params_round_trip(build, stiffness, n_lam):
         assert model.stiffness == stiffness
 
 
-def test_from_params_refuses_a_stiffness_that_cannot_represent_F(build):
+def test_from_params_refuses_what_no_model_represents(build):
     params = build.params(seed=4)
     smallest = float(torch.linalg.eigvalsh(0.5 * (params.F + params.F.T))[0])
     with pytest.raises(InvalidInputError, match=rf"less than the smallest eigenvalue {smallest:.3e}.*got 1000"):
         LCSModel.from_params(params, stiffness=1000.0)
-
-
-def test_from_params_refuses_a_batch_of_systems(build):
     refuse(ShapeError, r"no batch dimensions, got \(2,\)", LCSModel.from_params, build.params(batch=(2,)))
 
 

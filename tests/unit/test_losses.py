@@ -240,12 +240,9 @@ def test_gamma_at_the_bound_of_one_transition_and_zero(each, data):
 def test_a_gamma_that_double_precision_cannot_resolve_is_refused(each, data):
     with pytest.raises(GammaError, match=r"gamma: expected at least .* in double precision.*batch index \d"):
         violation_loss(each, *data, 1e-14)
-    with pytest.raises(
-        GammaError, match=r"gamma, xi: expected a product that double precision resolves.*at batch index"
-    ):
-        violation_loss(each, *data, 1e-9, 1e-9)
-    shared = each[0]
-    refuse(GammaError, "gamma, xi: expected a product", violation_loss, shared, *data, 1e-9, 1e-9)
+    product = "gamma, xi: expected a product that double precision resolves"
+    refuse(GammaError, f"{product}.*at batch index", violation_loss, each, *data, 1e-9, 1e-9)
+    refuse(GammaError, product, violation_loss, each[0], *data, 1e-9, 1e-9)
 
 
 def test_an_F_that_was_spoiled_after_its_check_is_named(each, data):
@@ -310,11 +307,9 @@ def test_a_model_with_params_of_its_own_is_asked_for_them(build, data):
 @pytest.mark.parametrize("function", [violation_loss, prediction_loss])
 def test_what_is_no_system_is_refused(build, each, data, function):
     sequence = LCSSequence(**each.tensors())
+    match = r"lcs: expected an LCSModel, another LCSModule or LCSParams, got .*; the st"
     for value in (None, "model", torch.nn.Linear(2, 2), sequence):
-        with pytest.raises(
-            DTypeError, match=r"lcs: expected an LCSModel, another LCSModule or LCSParams, got .*; the st"
-        ):
-            function(value, *data)
+        refuse(DTypeError, match, function, value, *data)
     module = Moving(build)
     module.params = lambda x=None, context=None: sequence
     refuse(DTypeError, r"Moving.params: expected LCSParams, got LCSSequence.*; transitions", function, module, *data)

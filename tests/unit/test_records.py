@@ -81,11 +81,9 @@ def test_one_system_has_no_index(build, sequence):
 
 @pytest.mark.parametrize("index", [4, -5, (0, 0), (0, ..., 0), torch.tensor([4]), "A", 1.0, torch.tensor([True] * 3)])
 def test_an_index_that_is_none_of_the_batch_is_refused(build, index):
+    match = r"expected an index of the batch dimensions \(4,\), got .*; index the"
     for record in (build.params(batch=(4,)), LCSSequence(**sequence_tensors(build, batch=(4,)))):
-        with pytest.raises(
-            BatchIndexError, match=r"expected an index of the batch dimensions \(4,\), got .*; index the"
-        ):
-            record[index]
+        refuse(BatchIndexError, match, record.__getitem__, index)
 
 
 def test_a_step_broadcasts_systems_states_and_actions(build):

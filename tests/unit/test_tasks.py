@@ -171,9 +171,6 @@ def test_a_registered_task_is_found_and_replaced_by_its_name():
     other = register_task(replace(mine, horizon=4))
     assert get_task("unit-toy") is other
     assert task_names().count("unit-toy") == 1
-
-
-def test_what_is_no_task_is_not_registered():
     refuse(DTypeError, "TaskSpec", register_task, {"name": "x"})
 
 

@@ -171,11 +171,9 @@ def test_a_step_size_that_is_not_positive_is_refused(size):
 # --- the natural gradient ---------------------------------------------------------------------------------------------
 
 
-def make_natural(
-    momentum: float = 0.0, damping: float = 0.0, lr: float = 0.3
-) -> tuple[list[nn.Parameter], NaturalGradient]:
+def make_natural(momentum: float = 0.0, damping: float = 0.0) -> tuple[list[nn.Parameter], NaturalGradient]:
     parameters = [nn.Parameter(torch.zeros(2, dtype=torch.float64)), nn.Parameter(torch.zeros(1, 1).double())]
-    return parameters, NaturalGradient(parameters, lr, momentum, damping)
+    return parameters, NaturalGradient(parameters, 0.3, momentum, damping)
 
 
 def flat(parameters) -> torch.Tensor:
