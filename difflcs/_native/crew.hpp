@@ -5,8 +5,8 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <cstdint>
 #include <functional>
-#include <memory>
 #include <mutex>
 #include <system_error>
 #include <thread>
@@ -37,8 +37,24 @@ class Crew {
     any_ = true;
     lock.unlock();
     for (size_t t = 1; t < threads; t++) come_.notify_one();
-    const std::unique_ptr<Job, Join> join(&job, Join{*this});
-    work(0);
+    try {
+      work(0);
+    } catch (...) {
+      end(job);
+      throw;
+    }
+    end(job);
+  }
+
+  // Calls work(t, i) for all i below count on thread t, until one of them says false.
+  template <class Work>
+  void each(size_t threads, int64_t count, Work work) {
+    std::atomic<int64_t> next{0};
+    std::atomic<bool> stop{false};
+    run(std::min<size_t>(threads, count), [&](size_t t) {
+      for (int64_t i; !stop && (i = next.fetch_add(1)) < count;)
+        if (!work(t, i)) stop = true;
+    });
   }
 
   // That of the process. A fork begins without threads.
@@ -59,14 +75,11 @@ class Crew {
     std::atomic<size_t> at_work{0};
   };
 
-  struct Join {  // also where work raises an exception
-    Crew& crew;
-    void operator()(Job* job) const {
-      std::unique_lock<std::mutex> lock(crew.mutex_);
-      crew.close(job);
-      await(lock, crew.done_, [&] { return job->at_work == 0; });
-    }
-  };
+  void end(Job& job) {
+    std::unique_lock<std::mutex> lock(mutex_);
+    close(&job);
+    await(lock, done_, [&] { return job.at_work == 0; });
+  }
 
   void live() {
     std::unique_lock<std::mutex> lock(mutex_);

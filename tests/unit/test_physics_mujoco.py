@@ -269,7 +269,7 @@ def test_a_tower_stands_on_four_contacts_a_face():
     speed = torch.stack(speeds)
     assert float(speed.max()) < 0.1  # as long as it settles; half a step of gravity is .25
     assert float((x - start)[:, :24].abs().max()) < 3e-3
-    assert float(speed[-1].median()) < 1e-4  # where rounding chooses other points of faces, MuJoCo's own moves by 2.5e-3
+    assert float(speed[-1].median()) < 1e-4  # where rounding chooses other points, MuJoCo's own moves by 2.5e-3
 
 
 @pytest.mark.parametrize("flag", ["contact", "constraint"])

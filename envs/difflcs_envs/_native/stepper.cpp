@@ -7,8 +7,6 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <stdexcept>
@@ -28,17 +26,6 @@ constexpr int kStateSize = 9;
 
 using StepFunction = void (*)(const void* model, void* data);
 using GetStateFunction = void (*)(const void* model, const void* data, double* state, int signature);
-
-// --- threads --------------------------------------------------------------------------------------
-
-// Calls work(0), ..., work(count - 1) on up to `threads` threads, this one included.
-template <class Work>
-void on_threads(int count, int threads, Work work) {
-  std::atomic<int> next{0};
-  difflcs::Crew::get().run(std::min(threads, count), [&](size_t) {
-    for (int i; (i = next.fetch_add(1)) < count;) work(i);
-  });
-}
 
 // --- one simulation -------------------------------------------------------------------------------
 
@@ -232,8 +219,10 @@ void step_lanes(const std::vector<const Lane*>& lanes, Actions actions, States s
   double* x = states.data();
   bool* ok = stable.data();
   nb::gil_scoped_release release;
-  on_threads(static_cast<int>(n), threads,
-             [&](int i) { ok[i] = lanes[i]->step(u + kActionSize * i, x + kStateSize * i); });
+  difflcs::Crew::get().each(threads, n, [&](size_t, int64_t i) {
+    ok[i] = lanes[i]->step(u + kActionSize * i, x + kStateSize * i);
+    return true;
+  });
 }
 
 }  // namespace

@@ -165,13 +165,7 @@ using Outcome = std::tuple<int64_t, int64_t, std::string>;
 template <class Work>
 void on_threads(size_t threads, int64_t count, Work work) {
   nb::gil_scoped_release release;
-  std::atomic<int64_t> next{0};
-  std::atomic<bool> stop{false};
-  const auto take = [&](size_t thread) {
-    for (int64_t i; !stop && (i = next.fetch_add(1)) < count;)
-      if (!work(thread, i)) stop = true;
-  };
-  difflcs::Crew::get().run(threads, take);
+  difflcs::Crew::get().each(threads, count, work);
 }
 
 // Calls work(place, state) for all states, a thread for each place.
