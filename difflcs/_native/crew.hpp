@@ -18,7 +18,7 @@
 
 namespace difflcs {
 
-constexpr auto kAwake = std::chrono::microseconds(100);  // the next work is often so near, and to wake up takes as long
+constexpr auto kAwake = std::chrono::microseconds(300);  // the next work is often so near, and to wake up takes long
 
 class Crew {
  public:
