@@ -1,8 +1,9 @@
-"""A batch of LCS-MPC problems in NumPy. Nothing here calls the code under test but `Case.problem`, which hands over."""
+"""A batch of LCS-MPC problems, in NumPy or torch. Only `Case.problem` calls the code under test: it hands over."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,8 @@ class Case:
     """A batch of problems.
 
     Attributes:
-        arrays: inputs by the names of `MPCProblem`, each shared, per element, by stage, or both; x0 (count, n_x).
+        inputs: arrays or tensors by the names of `MPCProblem`, each shared, per element, by stage (1, stages, …), or
+            both; x0 (count, n_x).
         horizon: H.
         relaxation: λ·s.
         barrier: weight of the barrier.
@@ -39,11 +41,11 @@ class Case:
         possible: (count,) True where one does for sure.
     """
 
-    arrays: dict[str, np.ndarray]
-    horizon: int
-    relaxation: float = 1e-5
+    inputs: dict[str, Any]
+    horizon: int = 3
+    relaxation: float = 1e-4
     barrier: float = 0.0
-    numbers: tuple[float, float] | None = None
+    numbers: dict[str, float] | None = None
     answer: np.ndarray | None = None
     witness: np.ndarray | None = None
     impossible: np.ndarray | None = None
@@ -52,43 +54,46 @@ class Case:
     @property
     def count(self) -> int:
         """Number of problems."""
-        return len(self.arrays["x0"])
+        return len(self.inputs["x0"])
 
     def shared(self, name: str) -> bool:
-        """Whether all elements and stages have the same."""
-        return name != "x0" and self.arrays[name].ndim == rank(name)
+        """Whether all elements have the same."""
+        value = self.inputs[name]
+        return value.ndim == rank(name) or (value.ndim == rank(name) + 2 and len(value) == 1 < self.count)
 
     def select(self, index) -> Case:
         """Some of the problems."""
-        arrays = {k: v if self.shared(k) else v[index] for k, v in self.arrays.items()}
+        inputs = {k: v if self.shared(k) else v[index] for k, v in self.inputs.items()}
         known = {k: getattr(self, k) for k in ("answer", "witness", "impossible", "possible")}
-        return replace(self, arrays=arrays, **{k: v if v is None else v[index] for k, v in known.items()})
+        return replace(self, inputs=inputs, **{k: v if v is None else v[index] for k, v in known.items()})
 
-    def full(self) -> dict[str, np.ndarray]:
-        """Every array with the batch in front."""
-        return {
-            k: np.broadcast_to(v, (self.count, *(v.shape if self.shared(k) else v.shape[1:])))
-            for k, v in self.arrays.items()
-        }
+    def full(self) -> dict[str, Any]:
+        """Every input with the batch in front, copied."""
+        lead = {k: v if v.ndim > rank(k) else v[None] for k, v in self.inputs.items()}
+        return {k: v[[i % len(v) for i in range(self.count)]] for k, v in lead.items()}
+
+    def by_stage(self) -> dict[str, Any]:
+        """The same with a dimension of stages after the batch, of one stage where all are alike; what is free is ∞."""
+        t = {k: v if v.ndim == rank(k) + 2 else v[:, None] for k, v in self.full().items()}
+        price = {"price": abs(t["g"]) + np.inf} if "g" in t else {}
+        return {"u_min": -np.inf, "u_max": np.inf, **price, **t}
 
     def each(self) -> Case:
         """The same problems, each with every input of its own."""
-        return replace(self, arrays={k: np.array(v) for k, v in self.full().items()}, numbers=None)
+        return replace(self, inputs=self.full(), numbers=None)
 
     def cast(self, dtype) -> Case:
         """The same in another precision."""
         with np.errstate(over="ignore", under="ignore"):
-            return self.changed(**{k: v.astype(dtype) for k, v in self.arrays.items()})
+            return self.changed(**{k: v.astype(dtype) for k, v in self.inputs.items()})
 
-    def changed(self, **arrays: np.ndarray) -> Case:
+    def changed(self, **inputs) -> Case:
         """The same with other inputs."""
-        return replace(self, arrays={**self.arrays, **arrays})
+        return replace(self, inputs={**self.inputs, **inputs})
 
-    def at(self, name: str, i: int, k: int) -> np.ndarray:
-        """One input of element i at stage k."""
-        value = self.arrays[name]
-        own = value if self.shared(name) else value[i if len(value) > 1 else 0]
-        return own[k] if own.ndim > rank(name) else own
+    def without(self, names) -> Case:
+        """The same without some inputs."""
+        return replace(self, inputs={k: v for k, v in self.inputs.items() if k not in names})
 
     def problem(self):
         """The batch as the backends take it."""
@@ -96,5 +101,5 @@ class Case:
 
         from difflcs.mpc.problem import MPCProblem
 
-        tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in self.arrays.items()}
+        tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in self.inputs.items()}
         return MPCProblem(**tensors, horizon=self.horizon, relaxation=self.relaxation)

@@ -34,9 +34,9 @@ def direction_of(name, value, n):
 def moves(build, solve, problem, base, backend):
     """Directions of all inputs, and the plans of copies with each moved by ±STEP, from the plans of `base`."""
     n, each = build.normal(41), problem.each()
-    directions = {k: direction_of(k, v, n) for k, v in each.tensors.items()}
+    directions = {k: direction_of(k, v, n) for k, v in each.inputs.items()}
     copies = [
-        {**each.tensors, k: each.tensors[k] + torch.where(directions[k] == 0, 0.0, sign * STEP * directions[k])}
+        {**each.inputs, k: each.inputs[k] + torch.where(directions[k] == 0, 0.0, sign * STEP * directions[k])}
         for k, sign in itertools.product(directions, (1, -1))
     ]
     stacked = {k: torch.cat([c[k] for c in copies]) for k in directions}
@@ -48,9 +48,9 @@ def moves(build, solve, problem, base, backend):
 
 def compare(build, solve, problem, base, backend, directions, moved):
     """Compare the gradient by every input, and return in how many of them anything moved."""
-    each, n, names, B = problem.each(), build.normal(42), tuple(directions), problem.batch
+    each, n, names, B = problem.each(), build.normal(42), tuple(directions), problem.count
     weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(B)]
-    leaves = {k: v.clone().requires_grad_() for k, v in each.tensors.items()}
+    leaves = {k: v.clone().requires_grad_() for k, v in each.inputs.items()}
     # All from the same start, so that all end in the same local optimum.
     sol = solve(each, backend, tensors=leaves, guess=base)
     gradients = torch.autograd.grad(weigh(sol, weights).sum(), [leaves[k] for k in names])

@@ -3,77 +3,19 @@
 A new form of problem is one more row of the tables at the end.
 """
 
-import dataclasses
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
 
 import difflcs
 from difflcs.cli.bench import pushing_model
 from difflcs.systems import pushing_cost
 from tests.conformance import judges
-from tests.conformance.cases import in_units, rank
+from tests.conformance.cases import Case, in_units, rank
 from tests.conformance.judges import affine, mul
 
 LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
 BOUNDS, ROWS = ("u_min", "u_max"), {"G_x": "G", "g": "g", "G_u": "E", "price": "weight"}  # their names in the records
 STAGED = (*LCS, "Q", "R", "S", "q", "r", *BOUNDS, *ROWS)  # all but Q_final, q_final, x0
-HORIZON, INF = 3, float("inf")
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A batch of problems; `staged` names what is given by stage."""
-
-    tensors: dict[str, Tensor]
-    staged: frozenset[str] = frozenset()
-    horizon: int = HORIZON
-    relaxation: float = 1e-4
-    barrier: float = 0.0
-
-    @property
-    def batch(self):
-        return len(self.tensors["x0"])
-
-    def own(self, name):
-        return rank(name) + (name in self.staged)
-
-    def stages(self, name):
-        return self.horizon + (name in ("G_x", "g", "price"))
-
-    def shared(self, name):
-        return self.tensors[name].ndim == self.own(name)
-
-    def each(self):
-        """The same with every input given per element, copied."""
-        full = {k: v.expand(self.batch, *v.shape[v.ndim - self.own(k) :]).clone() for k, v in self.tensors.items()}
-        return dataclasses.replace(self, tensors=full)
-
-    def element(self, i):
-        """Inputs of one element, as a batch of one."""
-        return self.part(slice(i, i + 1)).tensors
-
-    def part(self, index):
-        """Some of the elements."""
-        return self.changed(**{k: v if self.shared(k) else v[index] for k, v in self.tensors.items()})
-
-    def full(self):
-        """Every input of every element at every stage (batch, stages, …); x0 without stages."""
-        each, found = self.each().tensors, {"u_min": -INF, "u_max": INF}
-        for k, v in each.items():
-            found[k] = v if k == "x0" or k in self.staged else v.unsqueeze(1)
-        if "g" in each:
-            found.setdefault("price", torch.full_like(found["g"], INF))
-        return found
-
-    def changed(self, **tensors):
-        """The same with other inputs."""
-        return dataclasses.replace(self, tensors={**self.tensors, **tensors})
-
-    def without(self, names):
-        """The same without some inputs."""
-        return dataclasses.replace(self, tensors={k: v for k, v in self.tensors.items() if k not in names})
+INF = float("inf")
 
 
 class Asked(torch.nn.Module):
@@ -87,13 +29,20 @@ class Asked(torch.nn.Module):
         return self.cost
 
 
-def layer_of(t, staged, horizon, asked=False, **options):
-    """The layer that inputs by name describe, those of `staged` by stage; `asked`: its cost is a module."""
+def layer_of(problem, tensors=None, asked=False, **options):
+    """The layer of a problem, or of other inputs of its form; `asked`: its cost is a module."""
+    t = dict(tensors or problem.inputs)
+    staged = {k for k, v in t.items() if v.ndim == rank(k) + 2}
+    t |= {k: t[k][0] for k in staged if len(t[k]) == 1 < len(t["x0"])}  # the public records need no element in front
+    if staged & set(LCS):  # then all of the system is given by stage
+        t |= {k: torch.stack([t[k]] * problem.horizon, -1 - rank(k)) for k in set(LCS) - staged}
+        staged |= set(LCS)
     lcs = (difflcs.LCSSequence if "A" in staged else difflcs.LCSParams)(**{k: t[k] for k in LCS})
     weights, by_stage = {k: t[k] for k in COST if k in t}, tuple(staged & set(COST))
     kind = difflcs.CostSequence if by_stage else difflcs.QuadraticCost
     cost = kind(**weights, check=False, **({"by_stage": by_stage} if by_stage else {}))
-    limits, by_stage = {k: t[k] for k in BOUNDS if k in t}, tuple(staged & set(BOUNDS))
+    limits, by_stage = {k: t[k] for k in BOUNDS if k in t} | (problem.numbers or {}), tuple(staged & set(BOUNDS))
+    options = {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
     options |= {"bounds": difflcs.StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
     if "g" in t:
         rows = {name: t.get(key) for key, name in ROWS.items()}
@@ -101,13 +50,13 @@ def layer_of(t, staged, horizon, asked=False, **options):
         options["constraints"] = (
             difflcs.ConstraintSequence(**rows, by_stage=by_stage) if by_stage else difflcs.LinearConstraints(**rows)
         )
-    return difflcs.LCSMPCLayer(lcs, Asked(cost) if asked else cost, horizon, **options)
+    return difflcs.LCSMPCLayer(lcs, Asked(cost) if asked else cost, problem.horizon, **options)
 
 
 def solve(problem, backend, guess=None, tensors=None, **options):
     """The plan of the layer of a problem, or of other inputs of its form."""
-    t, given = tensors or problem.tensors, {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
-    return layer_of(t, problem.staged, problem.horizon, backend=backend, **given)(t["x0"], guess=guess)
+    t = tensors or problem.inputs
+    return layer_of(problem, t, backend=backend, **options)(t["x0"], guess=guess)
 
 
 # --- judges -----------------------------------------------------------------------------------------------------------
@@ -115,9 +64,9 @@ def solve(problem, backend, guess=None, tensors=None, **options):
 
 def rollout(problem, t, u):
     """States of actions by the public record, relaxed as the plan is."""
-    states = [t["x0"]]
+    states = [t["x0"][:, 0]]
     for k in range(problem.horizon):
-        now = {name: t[name][:, k if name in problem.staged else 0] for name in LCS}
+        now = {name: t[name][:, k % t[name].shape[1]] for name in LCS}
         D, E, F, c = (now[name] for name in "DEFc")
         lam = difflcs.solve_lcp(F, mul(D, states[-1]) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
         states.append(affine(now, "ABCd", states[-1], u[:, k], lam))
@@ -134,8 +83,8 @@ def cost(problem, t, x, u):
 
 def fines(problem, t, x, u, most=INF):
     """The price of violations; hard rows, and what is dearer, cost `most`, or nothing where that is infinite."""
-    if "g" not in problem.tensors:
-        return torch.zeros(problem.batch).double()
+    if "g" not in t:
+        return torch.zeros(problem.count).double()
     price = t["price"].clamp_max(most)
     return (torch.where(price < INF, price, 0.0) * judges.rows(t, x, u).clamp_min(0.0)).sum((1, 2))
 
@@ -160,21 +109,19 @@ def make(build, seed=0, batch=4, bound=0.15, n_x=4, n_u=2, n_lam=3, each=(), siz
     if "bounds" in each:
         spread = 0.5 + torch.rand(2, batch, n_u, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         tensors |= {"u_min": -limit * spread[0], "u_max": limit * spread[1]}
-    return vary(build, Problem(tensors, **options), staged)
+    return vary(build, Case(tensors, **options), staged)
 
 
-def vary(build, problem, names, seed=1):
+def vary(build, problem, names, seed=1, spread=0.2):
     """Each stage its own version of some inputs."""
-    tensors, n = dict(problem.tensors), build.normal(seed)
+    inputs, n = {}, build.normal(seed)
     for name in names:
-        value, rank = tensors[name], problem.own(name)
-        stages = problem.stages(name)
-        lead, own = value.shape[: value.ndim - rank], value.shape[value.ndim - rank :]
+        value, stages = problem.inputs[name], problem.horizon + (name in ("G_x", "g", "price"))
+        value = (value[None] if problem.shared(name) else value).unsqueeze(1)
         # Definite matrices are scaled as a whole, so that they stay definite.
-        shape = [1] * rank if name in ("Q", "R", "F", *BOUNDS) else own
-        factor = 1 + 0.2 * n(*lead, stages, *shape).clamp(-2, 2)
-        tensors[name] = value.unsqueeze(len(lead)) * factor
-    return dataclasses.replace(problem, tensors=tensors, staged=problem.staged | frozenset(names))
+        shape = [1] * rank(name) if name in ("Q", "R", "F", *BOUNDS) else value.shape[2:]
+        inputs[name] = value * (1 + spread * n(len(value), stages, *shape).clamp(-2, 2))
+    return problem.changed(**inputs)
 
 
 def contact(build):
@@ -183,7 +130,7 @@ def contact(build):
 
 def without_contact(build):
     problem = make(build, seed=3, batch=8, bound=50.0, relaxation=1e-3)
-    return problem.changed(C=torch.zeros_like(problem.tensors["C"]))
+    return problem.changed(C=torch.zeros_like(problem.inputs["C"]))
 
 
 def paper_sized(build):
@@ -192,14 +139,14 @@ def paper_sized(build):
     weights = {k: v.detach() for k, v in cost.fields().items()}
     bounds = {"u_min": -limit, "u_max": limit}
     tensors = {**pushing_model(5, 0).tensors(), **weights, **bounds, "x0": 0.05 * build.normal(3)(6, 9)}
-    return Problem(tensors, horizon=5, relaxation=1e-5)
+    return Case(tensors, horizon=5, relaxation=1e-5)
 
 
 def badly_scaled(build):
     """`contact` in other units of state, action and force; see the test that compares the two."""
-    t = contact(build).tensors
+    t = contact(build).inputs
     x, u, f = (torch.tensor(v, dtype=torch.float64) for v in ([1e3, 1e-2, 1.0, 1e-3], [1e-2, 10.0], [1e-2, 1e2, 1 / 3]))
-    return Problem(in_units(t, x, u, f))
+    return Case(in_units(t, x, u, f))
 
 
 def cross(build):
@@ -238,10 +185,10 @@ def hard(build):
 def terminal(build):
     """A constraint of the last state alone, by g = ∞ before it."""
     problem = with_rows(build, make(build, seed=13, bound=0.4))
-    g = torch.full((HORIZON + 1, 2), INF, dtype=torch.float64)
+    g = torch.full((1, problem.horizon + 1, 2), INF, dtype=torch.float64)
     free = solve(problem.without(ROWS), "ipopt")
-    g[-1, 0] = (free.x[:, -1] @ problem.tensors["G_x"][0]).median() - 0.01
-    return dataclasses.replace(problem.changed(g=g), staged=problem.staged | {"g"})
+    g[0, -1, 0] = (free.x[:, -1] @ problem.inputs["G_x"][0]).median() - 0.01
+    return problem.changed(g=g)
 
 
 def everything(build):

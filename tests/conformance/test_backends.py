@@ -63,9 +63,9 @@ def solutions(build):
 @every_backend_on(*problems.PLAIN, exact=[name for name in PROBLEMS if name not in problems.PLAIN])
 def test_plans_have_their_shapes_and_keep_bounds_and_exact_ones_dynamics_and_complementarity(solutions, name, backend):
     problem, sol = solutions(name, backend)
-    B, H, t = problem.batch, problem.horizon, problem.full()
-    n_x, n_u, n_lam = (problem.tensors[k].shape[-1] for k in "ABF")
-    n_c = problem.tensors["g"].shape[-1] if "g" in t else 0
+    B, H, t = problem.count, problem.horizon, problem.by_stage()
+    n_x, n_u, n_lam = (problem.inputs[k].shape[-1] for k in "ABF")
+    n_c = problem.inputs["g"].shape[-1] if "g" in t else 0
     assert (sol.x.shape, sol.u.shape, sol.lam.shape) == ((B, H + 1, n_x), (B, H, n_u), (B, H, n_lam))
     assert (sol.action.shape, sol.mu.shape, sol.violation.shape) == ((B, n_u), (B, H + 1, n_c), (B,))
     for info in (sol.objective, sol.status, sol.iterations, sol.kkt_residual, sol.solve_time):
@@ -74,7 +74,7 @@ def test_plans_have_their_shapes_and_keep_bounds_and_exact_ones_dynamics_and_com
     assert sol.status.dtype == torch.int8
     assert bool((sol.solve_time > 0).all())
     assert bool((sol.iterations > 0).all())
-    assert torch.equal(sol.x[:, 0], problem.tensors["x0"])
+    assert torch.equal(sol.x[:, 0], problem.inputs["x0"])
     assert bool(((sol.u >= t["u_min"]) & (sol.u <= t["u_max"])).all())
     if backend not in EXACT:
         return
@@ -94,7 +94,7 @@ def test_plans_have_their_shapes_and_keep_bounds_and_exact_ones_dynamics_and_com
 def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(build, solutions, name, backend):
     """Independent of kkt.py: autograd of a rollout, and random neighbours, violations at more than their multiplier."""
     problem, sol = solutions(name, backend)
-    t = problem.full()
+    t = problem.by_stage()
     expected = problems.cost(problem, t, sol.x, sol.u) + problems.fines(problem, t, sol.x, sol.u)
     torch.testing.assert_close(sol.objective, expected, rtol=1e-9, atol=1e-10)
 
@@ -122,7 +122,7 @@ def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(buil
 @every_exact
 def test_constraints_hold_or_are_paid_for(solutions, name, backend):
     problem, sol = solutions(name, backend)
-    t, mu = problem.full(), sol.mu
+    t, mu = problem.by_stage(), sol.mu
     value, price = judges.rows(t, sol.x, sol.u), t["price"].expand(mu.shape)
     torch.testing.assert_close(sol.violation, value.amax((1, 2)).clamp_min(0.0), rtol=0, atol=1e-9)
     assert float(value[price == INF].max() if (price == INF).any() else 0.0) <= 1e-7
@@ -142,7 +142,7 @@ def test_exact_backends_agree_where_they_find_the_same_optimum(solutions, name):
         problem, second = solutions(name, other)
         same = (first.objective - second.objective).abs() <= 1e-6 * (1 + first.objective.abs())
         assert float(same.double().mean()) >= 0.25
-        t = problem.full()
+        t = problem.by_stage()
         width = float(torch.as_tensor(t["u_max"] - t["u_min"]).clamp_max(1.0).max())
         assert float((first.u - second.u).abs()[same].max()) <= 1e-2 * width
         assert float((first.mu - second.mu).abs()[same].sum()) <= 1e-3 * (1 + float(first.mu.sum()))
@@ -163,7 +163,7 @@ def test_problems_are_of_the_kind_that_they_are_said_to_be(solutions, backend):
 def test_units_do_not_change_the_plan(solutions, backend):
     _, plain = solutions("contact", backend)
     problem, scaled = solutions("badly_scaled", backend)
-    U = problem.tensors["u_max"] / 0.15
+    U = problem.inputs["u_max"] / 0.15
     same = (scaled.objective - plain.objective).abs() < 1e-6 * (1 + plain.objective.abs())
     assert int(same.sum()) >= 6  # another local optimum is allowed, rarely
     torch.testing.assert_close((scaled.u / U)[same], plain.u[same], rtol=1e-4, atol=1e-5)
@@ -177,7 +177,7 @@ def test_a_weakly_active_bound_is_degenerate_and_has_the_gradient_of_one_side(bu
     k, ok = int(free.u[2, :, 1].argmax()), Status.CONVERGED
 
     def plan(shift):
-        t = problem.each().tensors
+        t = problem.full()
         t["u_max"][2, 1] = free.u[2, k, 1] + shift
         t["x0"].requires_grad_()
         sol = solve(problem, backend, tensors=t)
@@ -211,8 +211,8 @@ def test_a_kink_of_an_action_with_one_bound_at_zero_is_degenerate(backend, side)
 @every_backend_on("contact", "cost_and_bounds_per_element", exact=("stages_per_element", "everything", "hard"))
 def test_batch_equals_loop(solutions, name, backend):
     problem, sol = solutions(name, backend)
-    for i in range(problem.batch):
-        alone = solve(problem, backend, tensors=problem.element(i))
+    for i in range(problem.count):
+        alone = solve(problem.select(slice(i, i + 1)), backend)
         torch.testing.assert_close(alone.u[0], sol.u[i], rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(alone.lam[0], sol.lam[i], rtol=1e-5, atol=1e-8)
         torch.testing.assert_close(alone.mu[0], sol.mu[i], rtol=1e-4, atol=1e-6)
@@ -222,7 +222,7 @@ def test_batch_equals_loop(solutions, name, backend):
 @every_backend
 def test_an_empty_batch_is_solved(build, backend):
     problem = problems.contact(build)
-    t = {**problem.tensors, "x0": torch.empty(0, 4, dtype=torch.float64), "A": problem.tensors["A"].clone()}
+    t = {**problem.inputs, "x0": torch.empty(0, 4, dtype=torch.float64), "A": problem.inputs["A"].clone()}
     t["A"].requires_grad_()
     sol = solve(problem, backend, tensors=t)
     assert sol.u.shape == (0, 3, 2)
@@ -251,8 +251,7 @@ def test_forms_that_say_the_same_have_the_same_plan(build, backend):
     wide = problem.changed(u_min=-far, u_max=far)
     torch.testing.assert_close(solve(problem, backend).u, solve(wide, backend).u, rtol=1e-5, atol=1e-6)
     problem = problems.hard(build)
-    t = {k: v.expand(problem.stages(k), *v.shape) if k in STAGED else v for k, v in problem.tensors.items()}
-    sequence = dataclasses.replace(problem, tensors=t, staged=frozenset(set(t) & set(STAGED)))
+    sequence = problems.vary(build, problem, set(problem.inputs) & set(STAGED), spread=0.0)
     torch.testing.assert_close(solve(sequence, backend).u, solve(problem, backend).u, rtol=1e-6, atol=1e-8)
 
 
@@ -260,7 +259,7 @@ def test_forms_that_say_the_same_have_the_same_plan(build, backend):
 def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(solutions, name):
     problem, found = solutions(name, "batched")[0], []
     for asked in (False, True):
-        leaves = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
+        leaves = {k: v.clone().requires_grad_() for k, v in problem.inputs.items()}
         plan = solve(problem, "batched", tensors=leaves, asked=asked)
         (plan.u.sum() + plan.objective.sum()).backward()
         found.append([plan.u, plan.objective, *(leaves[k].grad for k in COST if k in leaves)])
@@ -272,11 +271,11 @@ def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(solutions, name):
 def test_a_price_above_the_multiplier_makes_a_soft_constraint_hard(build, backend):
     problem = problems.hard(build)
     plan = solve(problem, backend)
-    dear = {**problem.tensors, "price": torch.full((2,), 3 * float(plan.mu.max()), dtype=torch.float64)}
+    dear = {**problem.inputs, "price": torch.full((2,), 3 * float(plan.mu.max()), dtype=torch.float64)}
     # From the same local optimum: another program may lead a cold start to another one.
     soft_plan = solve(problem, backend, guess=plan, tensors=dear)
     torch.testing.assert_close(soft_plan.u, plan.u, rtol=1e-5, atol=1e-6)
-    cheap = {**problem.tensors, "price": torch.full((2,), 0.2 * float(plan.mu.max()), dtype=torch.float64)}
+    cheap = {**problem.inputs, "price": torch.full((2,), 0.2 * float(plan.mu.max()), dtype=torch.float64)}
     cheap_plan = solve(problem, backend, tensors=cheap)
     assert float(cheap_plan.violation.max()) > 1e-4
     assert float(cheap_plan.mu.max()) == pytest.approx(float(cheap["price"][0]), rel=1e-9)
@@ -285,7 +284,7 @@ def test_a_price_above_the_multiplier_makes_a_soft_constraint_hard(build, backen
 @every_exact
 def test_multipliers_are_what_a_wider_limit_would_save(build, backend):
     problem = problems.hard(build)
-    t = problem.each().tensors
+    t = problem.full()
     g = t["g"].clone().requires_grad_()
     sol = solve(problem, backend, tensors={**t, "g": g})
     (gradient,) = torch.autograd.grad(sol.objective.sum(), g)
@@ -295,7 +294,7 @@ def test_multipliers_are_what_a_wider_limit_would_save(build, backend):
 @every_exact
 def test_an_infeasible_element_is_a_status_and_spoils_no_other(build, backend):
     problem = problems.hard(build).each()
-    t = dict(problem.tensors)
+    t = dict(problem.inputs)
     bad = t["g"].clone()
     bad[2, 0] = (t["G_x"][2, 0] * t["x0"][2]).sum() - 0.3  # the first state violates it by 0.3, whatever follows
     x0 = t["x0"].clone().requires_grad_()
@@ -319,7 +318,7 @@ def test_an_infeasible_element_is_a_status_and_spoils_no_other(build, backend):
 def test_gradient_of_every_input_matches_central_differences(build, solutions, name, backend):
     problem, base = solutions(name, backend)
     if backend == "ipopt":  # which takes milliseconds for one: a few elements of every form
-        problem = problem.part(slice(3))
+        problem = problem.select(slice(3))
         base = solve(problem, backend)
     directions, moved = moves(build, solve, problem, base, backend)
     # Next to a solution nearly nothing is left to gain; rounding must not be taken for a failure.
@@ -332,8 +331,8 @@ def test_gradient_of_every_input_matches_central_differences(build, solutions, n
 def test_gradient_of_an_approximation_is_roughly_that_of_its_own_solve(build, solutions, backend):
     """A conic solver has few digits: a wide difference quotient, and a loose comparison."""
     problem, base = solutions("contact", backend)
-    n, h, each = build.normal(43), 1e-3, problem.each().tensors
-    weight, direction = n(*base.u.shape), 0.2 * n(problem.batch, 4)
+    n, h, each = build.normal(43), 1e-3, problem.full()
+    weight, direction = n(*base.u.shape), 0.2 * n(problem.count, 4)
     leaf = each["x0"].clone().requires_grad_()
     sol = solve(problem, backend, tensors={**each, "x0": leaf})
     (gradient,) = torch.autograd.grad((sol.u * weight).sum(), leaf)
@@ -347,13 +346,13 @@ def test_gradient_of_an_approximation_is_roughly_that_of_its_own_solve(build, so
 def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, solutions, name, backend):
     problem, base = solutions(name, backend)
     n, (rtol, atol) = build.normal(5), (1e-5, 1e-7) if backend in EXACT else (1e-2, 1e-3)
-    weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(problem.batch)]
-    shared = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
-    each = {k: v.requires_grad_() for k, v in problem.each().tensors.items()}
+    weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(problem.count)]
+    shared = {k: v.clone().requires_grad_() for k, v in problem.inputs.items()}
+    each = {k: v.requires_grad_() for k, v in problem.full().items()}
     for tensors in (shared, each):
         weigh(solve(problem, backend, tensors=tensors), weights).sum().backward()
-    for k in problem.tensors:
-        expected = each[k].grad.sum(0) if problem.shared(k) else each[k].grad
+    for k in problem.inputs:
+        expected = each[k].grad.sum(0).view_as(shared[k]) if problem.shared(k) else each[k].grad
         size = float(1 + each[k].grad.norm())
         torch.testing.assert_close(
             shared[k].grad, expected, rtol=rtol, atol=atol * size, msg=lambda m, k=k: f"{k}: {m}"
@@ -364,8 +363,8 @@ def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, sol
 def test_what_is_infinite_has_no_gradient(build, backend):
     for name, key in (("half_open", "u_max"), ("terminal", "g"), ("soft_and_hard", "price")):
         problem = PROBLEMS[name](build)
-        leaf = problem.tensors[key].clone().requires_grad_()
-        sol = solve(problem, backend, tensors={**problem.tensors, key: leaf})
+        leaf = problem.inputs[key].clone().requires_grad_()
+        sol = solve(problem, backend, tensors={**problem.inputs, key: leaf})
         (gradient,) = torch.autograd.grad(sol.u.sum() + sol.objective.sum(), leaf)
         infinite = torch.isinf(leaf)
         assert bool(infinite.any())
@@ -395,7 +394,7 @@ def test_a_backend_is_a_frozen_dataclass_whose_string_is_its_default_instance(ba
 )
 def test_each_mode_plans_at_its_own_relaxation(build, backend, options, training, evaluation):
     problem = make(build)
-    t = problem.tensors
+    t = problem.inputs
     lcs, cost = LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST if k in t})
     layer = LCSMPCLayer(lcs, cost, 3, t["u_min"], t["u_max"], backend, **options)
     for relaxation, mode in ((training, layer.train), (evaluation, layer.eval)):

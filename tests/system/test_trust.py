@@ -27,7 +27,7 @@ def test_a_residual_has_no_units(build):
     rough = {"max_iter": 1, "effort": "fast", "homotopy": 1.0, "shrink": 1e-3}
     found = []
     for problem in (contact(build), badly_scaled(build)):
-        values = MPCProblem(**{k: v for k, v in problem.tensors.items() if k in INPUTS}, horizon=3, relaxation=1e-4)
+        values = MPCProblem(**{k: v for k, v in problem.inputs.items() if k in INPUTS}, horizon=3, relaxation=1e-4)
         found.append(BatchedBackend(**rough).solve(values, None).kkt_residual)
     assert float(found[0].max()) > kkt.CERTIFIED
     torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-10)

@@ -44,8 +44,7 @@ def reaching(build):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, name, tmp_path):
     problem, solution = PROBLEMS[name](build), None
-    options = {"relaxation": problem.relaxation, "barrier": problem.barrier}
-    mpc = layer_of(problem.element(0), problem.staged, problem.horizon, **options)
+    mpc = layer_of(problem.select(slice(1)))
     mpc.controller().save(tmp_path / "c")
     controller = mpc.controller()
     loaded = MPCController.load(tmp_path / "c", on_failure="zero", time_limit=60.0)
@@ -53,7 +52,7 @@ def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, na
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
     refuse(InvalidInputError, "path: expected a place to write", loaded.save, tmp_path)
-    for x in problem.tensors["x0"][:4]:
+    for x in problem.inputs["x0"][:4]:
         solution = mpc(x, guess=None if solution is None else solution.shift())
         u, plan = controller.step(x.numpy()), controller.plan
         assert np.array_equal(loaded.step(x.numpy()), u)

@@ -25,7 +25,7 @@ def test_the_reduced_gradient_is_that_of_the_lagrangian_along_the_rollout(build,
     x, lam = problem.rollout(u)
     mu = n(3, problem.horizon + 1, problem.n_c).abs() * torch.isfinite(problem.g)
     found = kkt.multipliers(problem, Primal(x, u, lam, mu)).gradient
-    t, trajectory = checks.by_stage(case), [v.numpy() for v in (x, u, lam)]
+    t, trajectory = case.by_stage(), [v.numpy() for v in (x, u, lam)]
     s, terms = checks.affine(t, "DEFc", *trajectory)
     off = np.abs(trajectory[2] * s - case.relaxation) / (case.relaxation + 1e-7 * trajectory[2] * terms)
     assert off.max(initial=0.0) < 1e-7

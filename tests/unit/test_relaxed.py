@@ -7,17 +7,18 @@ from difflcs import Status
 from difflcs.errors import InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend
-from tests.conformance.problems import Problem, badly_scaled, contact, make
+from tests.conformance.cases import Case
+from tests.conformance.problems import badly_scaled, contact, make
 from tests.conformance.problems import solve as solve_problem
 from tests.conftest import refuse
 
 
 def tensors(build, **options):
-    return make(build, **{"batch": 4, **options}).tensors
+    return make(build, **{"batch": 4, **options}).inputs
 
 
 def solve(t, backend="relaxed", guess=None, **options):
-    return solve_problem(Problem(t), backend, guess=guess, **options)
+    return solve_problem(Case(t), backend, guess=guess, **options)
 
 
 def without_contact(build, **options):
@@ -72,8 +73,8 @@ def test_without_contact_the_plan_is_the_exact_one(build, bound, barrier):
 
 
 def test_the_plan_does_not_depend_on_units(build):
-    scaled = badly_scaled(build).tensors
-    U, plain = scaled["u_max"] / 0.15, contact(build).tensors
+    scaled = badly_scaled(build).inputs
+    U, plain = scaled["u_max"] / 0.15, contact(build).inputs
     torch.testing.assert_close(solve(scaled).u / U, solve(plain).u, rtol=1e-6, atol=1e-8)
 
 

@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from tests.conformance import judges
-from tests.conformance.cases import Case, rank
+from tests.conformance.cases import Case
 from tests.conformance.hostile.generators import LCP, Loss
 from tests.conformance.judges import mul
 
@@ -96,7 +96,7 @@ def judge_mpc(
     - answer: the vertex of a linear program.
     """
     with np.errstate(all="ignore"):
-        t, relaxation = by_stage(problem), problem.relaxation
+        t, relaxation = problem.by_stage(), problem.relaxation
         mu = np.zeros((*x.shape[:2], 0)) if mu is None else mu
         low, high = t["u_min"], t["u_max"]
         predicted, next_terms = affine(t, "ABCd", x, u, lam)
@@ -113,7 +113,7 @@ def judge_mpc(
         return {
             **found,
             "finite": finite(x, u, lam, mu, objective),
-            "start": np.where((x[:, 0] == problem.arrays["x0"]).all(-1), 0.0, np.inf),
+            "start": np.where((x[:, 0] == problem.inputs["x0"]).all(-1), 0.0, np.inf),
             "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
             "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
             "dynamics": _ratio(np.abs(x[:, 1:] - predicted), 1e-6 * next_terms),
@@ -122,11 +122,6 @@ def judge_mpc(
             "objective": _ratio(np.abs(objective - cost), 1e-9 * cost_terms),
             "answer": _vertex(problem, u, low, high),
         }
-
-
-def by_stage(problem: Case) -> dict:
-    """Inputs of all elements with a dimension of stages after the batch, of one stage where all have the same."""
-    return {k: v if v.ndim == rank(k) + 2 else v[:, None] for k, v in problem.full().items()}
 
 
 def affine(t: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +228,7 @@ def judge_relaxed_program(
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):
         ratios = judge_mpc(problem, x, u, lam, objective)
-        s, terms = affine(by_stage(problem), "DEFc", x, u, lam)
+        s, terms = affine(problem.by_stage(), "DEFc", x, u, lam)
         kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
         return {
             **{k: ratios[k] for k in kept},

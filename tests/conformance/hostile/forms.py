@@ -47,9 +47,9 @@ def plain(rng: Generator, count: int, small: bool = False) -> Case:
 def _form(rng: Generator, count: int, need_rows: bool = False, **options) -> Case:
     while True:
         case = random_case(int(rng.integers(1 << 30)), count, **options)
-        if case.horizon <= 12 and ("g" in case.arrays or not need_rows):
+        if case.horizon <= 12 and ("g" in case.inputs or not need_rows):
             break
-    known = np.full(count, case.witness is not None or "g" not in case.arrays)
+    known = np.full(count, case.witness is not None or "g" not in case.inputs)
     return replace(case.each(), witness=None, impossible=np.zeros(count, bool), possible=known)
 
 
@@ -58,7 +58,7 @@ def _staged_rows(rng: Generator, count: int) -> tuple[Case, dict[str, np.ndarray
     form = _form(rng, count, need_rows=True)
     arrays = {}
     for name in ROWS:
-        value, stages = form.arrays[name], form.horizon + (name != "G_u")
+        value, stages = form.inputs[name], form.horizon + (name != "G_u")
         if value.ndim == rank(name) + 1:
             value = np.repeat(value[:, None], stages, 1)
         arrays[name] = value.copy()
@@ -106,7 +106,7 @@ def first_stage(rng: Generator, count: int, small: bool = False) -> Case:
     """Constraints at stage 0 alone, about x0 and the first actions: met or not whatever follows."""
     form, a = _staged_rows(rng, count)
     a["g"][:, 1:] = INF
-    there = np.einsum("bij,bj->bi", a["G_x"][:, 0], form.arrays["x0"])
+    there = np.einsum("bij,bj->bi", a["G_x"][:, 0], form.inputs["x0"])
     a["g"][:, 0] = there + rng.choice([-1.0, -1e-8, 0.0, 1e-8, 1.0], there.shape)
     blind = rng.random() < 0.5
     if blind:
@@ -119,7 +119,7 @@ def first_stage(rng: Generator, count: int, small: bool = False) -> Case:
 def not_numbers(rng: Generator, count: int, small: bool = False) -> Case:
     """NaN or −∞ in one input of some elements, ∞ where none is allowed: to be refused before anything is solved."""
     form = _form(rng, count)
-    arrays = {k: v.copy() for k, v in form.arrays.items()}
+    arrays = {k: v.copy() for k, v in form.inputs.items()}
     name = str(rng.choice([k for k, v in arrays.items() if v[0].size]))
     chosen = rng.random(count) < 0.3
     value = np.nan if name in ("u_min", "u_max", "g", "price") else rng.choice([np.nan, INF, -INF])
@@ -131,8 +131,8 @@ def not_numbers(rng: Generator, count: int, small: bool = False) -> Case:
 def extreme(rng: Generator, count: int, small: bool = False) -> Case:
     """One input times 1e±(50 … 300) in some elements."""
     form = _form(rng, count)
-    name = str(rng.choice(list(form.arrays)))
-    value = form.arrays[name].copy()
+    name = str(rng.choice(list(form.inputs)))
+    value = form.inputs[name].copy()
     factor = 10.0 ** (rng.uniform(50, 300) * rng.choice([-1, 1]))
     chosen = rng.random(count) < 0.5
     with np.errstate(over="ignore"):
@@ -153,7 +153,7 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Case:
     What is summed to the gradient cancels to rounding at a vertex, and states at rest are rounding.
     """
     form = _form(rng, count, need_rows=True, n_lam=0)
-    a = {k: v.copy() for k, v in form.arrays.items()}
+    a = {k: v.copy() for k, v in form.inputs.items()}
     for name in ("Q", "R", "S", "Q_final"):
         a[name] *= 0.0
     for name in ("q", "r", "q_final"):
@@ -176,11 +176,11 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Case:
 def judge(form: Case, *numbers: np.ndarray) -> checks.Ratios:
     """Promises of a solution, and of a linear program its optimum."""
     case = form
-    if "price" in case.arrays:  # from 1e300 on a constraint is hard, see `Constraints`
-        price = case.arrays["price"]
+    if "price" in case.inputs:  # from 1e300 on a constraint is hard, see `Constraints`
+        price = case.inputs["price"]
         case = case.changed(price=np.where(price >= 1e300, INF, price))
     found = checks.judge_mpc(case, *numbers)
-    if not case.arrays["c"].size:
+    if not case.inputs["c"].size:
         gaps = [programs.above_optimum(case, i, u) for i, u in enumerate(numbers[1])]
         found["optimum of a linear program"] = np.array([0.0 if gap is None else gap / 1e-6 for gap in gaps])
     return found
@@ -190,7 +190,7 @@ def form_target(form: Case, rng: Generator, gradients: bool, guess=cold) -> Outc
     """Solve, differentiate and judge; also whether a status is true."""
     done = refused_one_by_one(lambda part: solve_mpc(part, np.float64, "batched", guess, judge), form)
     done.ratios["solved what is impossible"] = np.where(done.solved & form.impossible, INF, 0.0)
-    if not form.arrays["c"].size:
+    if not form.inputs["c"].size:
         wrong = (done.status == Status.INFEASIBLE) & form.possible
         done.ratios["false INFEASIBLE of a convex program"] = np.where(wrong, INF, 0.0)
     return done
@@ -200,7 +200,7 @@ def untouched(form: Case, rng: Generator, gradients: bool) -> Outcome:
     """What becomes of some elements leaves the others as they are, bit for bit, gradients of x0 included."""
     spoilt = np.zeros(form.count, bool)
     spoilt[rng.permutation(form.count)[: max(1, form.count // 3)]] = True
-    arrays = {k: v.copy() for k, v in form.arrays.items()}
+    arrays = {k: v.copy() for k, v in form.inputs.items()}
     kind = rng.integers(4)
     with np.errstate(over="ignore"):
         if kind == 0 and "g" in arrays:

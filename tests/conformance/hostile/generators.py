@@ -228,14 +228,14 @@ def mpc_plain(rng: Generator, count: int, small: bool = False) -> Case:
 def mpc_skew(rng: Generator, count: int, small: bool = False, *, epsilon: float) -> Case:
     """The plain problem with F = K − Kᵀ + ε·I: forces up to 1/ε times the gaps."""
     problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
-    K = rng.standard_normal(problem.arrays["F"].shape)
+    K = rng.standard_normal(problem.inputs["F"].shape)
     return problem.changed(F=K - K.swapaxes(-1, -2) + epsilon * np.eye(K.shape[-1]))
 
 
 def mpc_stiff(rng: Generator, count: int, small: bool = False) -> Case:
     """F nearly singular (low rank + 1e-2 … 1e-10) or graded (diagonal 1e-8 … 1e8)."""
     problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
-    F = problem.arrays["F"]
+    F = problem.inputs["F"]
     if rng.random() < 0.5:
         G = rng.standard_normal((*F.shape[:-1], max(1, F.shape[-1] // 2)))
         return problem.changed(F=G @ G.swapaxes(-1, -2) + power(rng, -10, -2, 1) * np.eye(F.shape[-1]))
@@ -259,7 +259,7 @@ def _linear_answer(problem: Case) -> np.ndarray:
 
 
 def _linear_cost(problem: Case, rng: Generator) -> Case:
-    a = problem.arrays
+    a = problem.inputs
     new = {name: np.zeros_like(a[name]) for name in ("Q", "R", "Q_final")}
     for name in ("q", "r", "q_final"):
         new[name] = rng.standard_normal(a[name].shape)
@@ -269,11 +269,11 @@ def _linear_cost(problem: Case, rng: Generator) -> Case:
 def mpc_flat(rng: Generator, count: int, small: bool = False) -> Case:
     """Q = R = Q_final = 0, linear terms of size 1, no effect of λ on the states: a linear program, known vertex."""
     problem = _linear_cost(_mpc(rng, count, small), rng)
-    problem = problem.changed(C=np.zeros_like(problem.arrays["C"]))
+    problem = problem.changed(C=np.zeros_like(problem.inputs["C"]))
     if rng.random() < 0.5:
-        zero = {k: np.zeros_like(problem.arrays[k]) for k in ("q", "q_final")}
+        zero = {k: np.zeros_like(problem.inputs[k]) for k in ("q", "q_final")}
         problem = problem.changed(**zero)
-    problem = problem.changed(D=np.zeros_like(problem.arrays["D"]), E=np.zeros_like(problem.arrays["E"]))
+    problem = problem.changed(D=np.zeros_like(problem.inputs["D"]), E=np.zeros_like(problem.inputs["E"]))
     return replace(problem, answer=_linear_answer(problem))
 
 
@@ -285,7 +285,7 @@ def mpc_flat_contact(rng: Generator, count: int, small: bool = False) -> Case:
 def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> Case:
     """R, Q, Q_final of 1e-12 … 1e-4 beside linear terms of 1e-6 … 1, |u| ≤ 0.05: curvature that says nothing."""
     problem = _linear_cost(_mpc(rng, count, small), rng)
-    a = problem.arrays
+    a = problem.inputs
     curvature, linear = float(power(rng, -12, -4, 1)[0]), float(power(rng, -6, 0, 1)[0])
     new = {k: curvature * definite(rng, *a[k].shape, skew=0) for k in ("Q", "R", "Q_final")}
     new |= {k: linear * a[k] for k in ("q", "r", "q_final")}
@@ -296,7 +296,7 @@ def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> Case:
 def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> Case:
     """One action without cost or effect (its part of B, E, R zero) in half of the elements, or with a linear cost."""
     problem = _mpc(rng, count, small).each()
-    B, E, R, r = (problem.arrays[k] for k in ("B", "E", "R", "r"))
+    B, E, R, r = (problem.inputs[k] for k in ("B", "E", "R", "r"))
     dead = rng.random(count) < 0.5
     j = int(rng.integers(B.shape[-1]))
     B[dead, :, j] = 0.0
@@ -306,8 +306,8 @@ def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> Case:
     r[dead, j] *= rng.integers(0, 2, int(dead.sum()))
     if rng.random() < 0.3:  # one such element in a shared system makes all of its gradient NaN
         first = problem.select(slice(0, 1))
-        arrays = {k: v if k == "x0" else v[0] for k, v in first.arrays.items()}
-        return replace(problem, arrays={**arrays, "x0": problem.arrays["x0"]})
+        arrays = {k: v if k == "x0" else v[0] for k, v in first.inputs.items()}
+        return replace(problem, inputs={**arrays, "x0": problem.inputs["x0"]})
     return problem
 
 
@@ -316,7 +316,7 @@ def mpc_unstable(rng: Generator, count: int, small: bool = False) -> Case:
     horizon = int(rng.integers(2, 4)) if small else int(rng.choice([3, 5, 8, 14, 20, 40, 60]))
     problem = _mpc(rng, count, small, horizon=horizon)
     a = rng.choice([1.5, 3.0, 10.0, 100.0, 1000.0])
-    A = problem.arrays["A"]
+    A = problem.inputs["A"]
     return problem.changed(
         A=a * np.eye(A.shape[-1]) + (0.05 * rng.standard_normal(A.shape) if rng.random() < 0.5 else 0)
     )
@@ -325,16 +325,16 @@ def mpc_unstable(rng: Generator, count: int, small: bool = False) -> Case:
 def mpc_number_bounds(rng: Generator, count: int, small: bool = False) -> Case:
     """Bounds as Python floats that no float32 holds (0.3, 0.1, 1/3, 0.7), most actions pressed against them."""
     problem = _mpc(rng, count, small)
-    a = problem.arrays
-    bounds = (-float(rng.choice([0.1, 0.3, 1 / 3])), float(rng.choice([0.3, 0.1, 0.7])))
-    new = {"u_min": np.full(a["u_min"].shape[-1], bounds[0]), "u_max": np.full(a["u_max"].shape[-1], bounds[1])}
+    a = problem.inputs
+    bounds = {"u_min": -float(rng.choice([0.1, 0.3, 1 / 3])), "u_max": float(rng.choice([0.3, 0.1, 0.7]))}
+    new = {k: np.full(a[k].shape[-1], v) for k, v in bounds.items()}
     return replace(problem.changed(r=20 * a["r"], **new), numbers=bounds)
 
 
 def mpc_touching(rng: Generator, count: int, small: bool = False) -> Case:
     """Bounds that touch, and ranges of 1e-12, 1e-6, 1 and 1e8 [action units] beside each other, off the origin."""
     problem = _mpc(rng, count, small)
-    a = problem.arrays
+    a = problem.inputs
     centre = rng.standard_normal(a["u_min"].shape)
     width = rng.choice([0.0, 1e-12, 1e-6, 1.0, 1e8], a["u_min"].shape)
     return problem.changed(u_min=centre - 0.5 * width, u_max=centre + 0.5 * width)
@@ -346,7 +346,7 @@ def mpc_units(rng: Generator, count: int, small: bool = False) -> Case:
     λ·s keeps its unit, so that the relaxation stays as it is; the answer is that of the plain problem in these units.
     """
     problem = _mpc(rng, count, small)
-    a = problem.arrays
+    a = problem.inputs
     n_x, n_u, n_lam = a["A"].shape[-1], a["B"].shape[-1], a["C"].shape[-1]
     if rng.random() < 0.5:
         x, u, f = np.full(n_x, 1e6), np.full(n_u, 1e-6), np.full(n_lam, 1e3)
@@ -360,7 +360,7 @@ def mpc_cost_scale(rng: Generator, count: int, small: bool = False) -> Case:
     problem = _mpc(rng, count, small)
     factor = float(power(rng, -8, 8, 1)[0])
     names = ("Q", "R", "Q_final", "q", "r", "q_final")
-    return problem.changed(**{k: factor * problem.arrays[k] for k in names})
+    return problem.changed(**{k: factor * problem.inputs[k] for k in names})
 
 
 def mpc_extreme(rng: Generator, count: int, small: bool = False) -> Case:
@@ -369,14 +369,14 @@ def mpc_extreme(rng: Generator, count: int, small: bool = False) -> Case:
     factor = float(power(rng, 50, 300, 1)[0] ** rng.choice([-1.0, 1.0]))
     name = str(rng.choice([*MATRICES, "d", "c", "q", "r", "q_final", "x0", "cost"]))
     names = ("Q", "R", "Q_final", "q", "r", "q_final") if name == "cost" else (name,)
-    return problem.changed(**{k: factor * problem.arrays[k] for k in names})
+    return problem.changed(**{k: factor * problem.inputs[k] for k in names})
 
 
 def mpc_stuck(rng: Generator, count: int, small: bool = False) -> Case:
     """Exact zeros: x0, d, c, q, r, q_final zero, contacts that just touch; the origin is a point of symmetry."""
     problem = _mpc(rng, count, small)
     names = [k for k in ("d", "c", "q", "r", "q_final", "x0") if rng.random() < 0.8]
-    return problem.changed(**{k: np.zeros_like(problem.arrays[k]) for k in names})
+    return problem.changed(**{k: np.zeros_like(problem.inputs[k]) for k in names})
 
 
 # ---- violation loss -------------------------------------------------------------------------------------------------

@@ -18,12 +18,11 @@ from difflcs.mpc import Primal
 from difflcs.mpc.backends import IpoptBackend
 from difflcs.mpc.problem import INPUTS
 from tests.conformance import problems
-from tests.conformance.cases import Case, rank
+from tests.conformance.cases import Case
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.generators import LCP, Loss
 
 REFUSED = -1  # in place of a status: a typed error
-SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 
 
 @dataclass
@@ -208,41 +207,30 @@ def _compare(terms: np.ndarray, difference, step: float, of_terms: float = 1e-7)
 
 # ---- LCSMPCLayer ----------------------------------------------------------------------------------------------------
 
-
-def layer_of(problem: Case, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
-    """The layer of problems, through the public records."""
-    tensors, staged = dict(leaves), frozenset(k for k, v in leaves.items() if v.ndim == rank(k) + 2)
-    if staged & set(SYSTEM):  # then all of the system is given by stage
-        for k in set(SYSTEM) - staged:
-            tensors[k] = leaves[k].unsqueeze(1).expand(-1, problem.horizon, *leaves[k].shape[1:])
-        staged |= set(SYSTEM)
-    if problem.numbers:
-        tensors["u_min"], tensors["u_max"] = problem.numbers
-    options = {"relaxation": problem.relaxation, "barrier": problem.barrier, "on_failure": "mask"}
-    return problems.layer_of(tensors, staged, problem.horizon, backend=backend, **options)
+layer_of = partial(problems.layer_of, on_failure="mask")
 
 
 def leaves_of(problem: Case) -> dict[str, torch.Tensor]:
     """Every input as a tensor that requires a gradient."""
-    return {k: torch.from_numpy(np.array(problem.arrays[k])).requires_grad_() for k in INPUTS if k in problem.arrays}
+    return {k: torch.from_numpy(np.array(problem.inputs[k])).requires_grad_() for k in INPUTS if k in problem.inputs}
 
 
 def solve_mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
     """Plan, differentiate and judge."""
     leaves = leaves_of(problem)
     with quiet(), np.errstate(all="ignore"):
-        layer = layer_of(problem, leaves, backend)
+        layer = layer_of(problem, leaves, backend=backend)
         plan = layer(leaves["x0"], guess=guess(problem, layer, leaves["x0"]))
         (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.sum((-1, -2)) + plan.objective).sum().backward()
         judged, wide = plan, problem.cast(np.float64)
         if dtype != np.float64:
             doubles = leaves_of(wide)
-            judged = layer_of(wide, doubles, backend)(doubles["x0"])
+            judged = layer_of(wide, doubles, backend=backend)(doubles["x0"])
     names, status = ("x", "u", "lam", "objective", "mu", "violation"), plan.status.numpy().astype(int)
     ratios = judge(wide, *(_numpy(getattr(judged, k)) for k in names))
     ratios["finite"] = checks.finite(*(_numpy(getattr(plan, k)) for k in (*names, "kkt_residual")))
     # Bounds are rounded inwards, or to their neighbours where that crosses.
-    low, high = (checks.by_stage(wide)[k] for k in ("u_min", "u_max"))
+    low, high = (wide.by_stage()[k] for k in ("u_min", "u_max"))
     inner_low, inner_high = low.astype(dtype), high.astype(dtype)
     inner_low = np.where(inner_low < low, np.nextafter(inner_low, dtype(np.inf)), inner_low)
     inner_high = np.where(inner_high > high, np.nextafter(inner_high, dtype(-np.inf)), inner_high)
@@ -302,12 +290,9 @@ def mpc_target(
 ) -> Outcome:  # fmt: skip
     """`barrier` is a part of the cost of the plain problems, which is of size 1."""
     if barrier > 0:
-        open_ = np.broadcast_to(problem.arrays["u_max"] - problem.arrays["u_min"], problem.full()["u_min"].shape)
-        keep = (open_ > 0).all(-1)  # a barrier needs a range
-        if not keep.all():
-            low, high = problem.full()["u_min"], problem.full()["u_max"]
-            high = np.where(high > low, high, low + 1.0)
-            problem = replace(problem, arrays={**problem.arrays, "u_min": low.copy(), "u_max": high})
+        low, high = problem.full()["u_min"], problem.full()["u_max"]
+        if not (high > low).all():  # a barrier needs a range
+            problem = problem.changed(u_min=low, u_max=np.where(high > low, high, low + 1.0))
         problem = replace(problem, barrier=barrier * float(rng.choice([1.0, 0.1, 10.0])))
     problem = _castable(problem, dtype)
     chosen = interior if guess is opposite and rng.random() < 0.3 else guess
@@ -330,12 +315,12 @@ def _castable(problem: Case, dtype) -> Case:
     if dtype == np.float64:
         return problem
     small = problem.cast(dtype)
-    finite = {k: np.nan_to_num(v) for k, v in small.arrays.items()}
+    finite = {k: np.nan_to_num(v) for k, v in small.inputs.items()}
     # Rounding must not make bounds cross.
     finite["u_max"] = np.maximum(finite["u_max"], finite["u_min"])
     if problem.numbers:  # which have no dtype
-        finite |= {k: problem.arrays[k] for k in ("u_min", "u_max")}
-    return replace(small, arrays=finite)
+        finite |= {k: problem.inputs[k] for k in ("u_min", "u_max")}
+    return replace(small, inputs=finite)
 
 
 def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray, int]:
@@ -345,7 +330,7 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
     their range; everything else by a part of its own size.
     """
     count = problem.count
-    a = problem.arrays
+    a = problem.inputs
     draws = {k: rng.standard_normal(v.shape[:2] if k in ("Q", "R", "Q_final", "F") else v.shape) for k, v in a.items()}
 
     def moved(step: float) -> Case:
@@ -358,7 +343,7 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
                 new[k] = v + step * draws[k] * (a["u_max"] - a["u_min"])
             else:
                 new[k] = v * (1 + step * draws[k])
-        return replace(problem, arrays=new, answer=None)
+        return replace(problem, inputs=new, answer=None)
 
     def direction(k: str) -> np.ndarray:
         if k in ("Q", "R", "Q_final", "F"):
@@ -368,7 +353,7 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
     leaves = leaves_of(problem)
     with quiet(), np.errstate(all="ignore"):
         try:
-            plan = layer_of(problem, leaves, backend)(leaves["x0"])
+            plan = layer_of(problem, leaves, backend=backend)(leaves["x0"])
         except DiffLCSError:
             return np.zeros(count), 0
         names = ("x", "u", "lam")
@@ -394,7 +379,7 @@ def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray
             shifted = moved(step)
             tensors = leaves_of(shifted)
             with torch.no_grad():
-                return layer_of(shifted, tensors, backend)(tensors["x0"], guess=guess)
+                return layer_of(shifted, tensors, backend=backend)(tensors["x0"], guess=guess)
 
         def difference(step: float) -> tuple[np.ndarray, np.ndarray]:
             try:

@@ -79,10 +79,10 @@ def test_every_form_and_size_is_solved(problems, chunks):
 def test_elements_whose_sweep_must_exchange_rows_change_no_gradient_of_others(monkeypatch):
     """At a nearly skew F the sweep of the gradients is done a second time, of these elements alone."""
     problem, rng = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched").chunk(0, 0)
-    F, bad = problem.arrays["F"].copy(), np.arange(problem.count) % 2 == 0
+    F, bad = problem.inputs["F"].copy(), np.arange(problem.count) % 2 == 0
     K = rng.standard_normal(F.shape)
     F[bad] = (K - K.swapaxes(-1, -2) + 1e-10 * np.eye(F.shape[-1]))[bad]
-    problem, fragile, vjp = replace(problem, arrays=problem.arrays | {"F": F}), [], BatchedBackend.vjp
+    problem, fragile, vjp = replace(problem, inputs=problem.inputs | {"F": F}), [], BatchedBackend.vjp
 
     def spied(self, problem, result, grads, solved):
         fragile.append(result.fragile & solved)

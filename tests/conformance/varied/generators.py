@@ -81,15 +81,15 @@ class _Form:
 
 def _constrained(case: Case, rng: Generator, form: _Form) -> Case:
     """Rows that the plan without them violates. Two thirds of the cases keep a plan that is known to meet them."""
-    n_x, n_u = case.arrays["B"].shape[-2:]
+    n_x, n_u = case.inputs["B"].shape[-2:]
     n_c, batch, horizon = int(rng.integers(1, 5)), case.count, case.horizon
     G_x = rng.standard_normal((n_c, n_x)) * (rng.random((n_c, 1)) < 0.9)
     G_u = 0.5 * rng.standard_normal((n_c, n_u)) * ((rng.random((n_c, 1)) < 0.5) | ~G_x.any(1, keepdims=True))
     price = np.where(rng.random(n_c) < 0.5, INF, np.exp(rng.uniform(-4, 2, n_c)))
-    arrays = {**case.arrays, "G_x": form.vary("G_x", G_x) * (G_x != 0), "G_u": form.vary("G_u", G_u) * (G_u != 0)}
+    arrays = {**case.inputs, "G_x": form.vary("G_x", G_x) * (G_x != 0), "G_u": form.vary("G_u", G_u) * (G_u != 0)}
     arrays["price"] = form.scale("price", price)
     arrays["g"] = np.zeros(n_c)
-    problem = replace(case, arrays=arrays).problem()
+    problem = replace(case, inputs=arrays).problem()
     # Of a plant that runs away a thousand iterations from each start would take a minute.
     free = BatchedBackend(threads=1, max_iter=200).solve(case.problem(), None).primal
     known = rng.random() < 0.67
@@ -109,4 +109,4 @@ def _constrained(case: Case, rng: Generator, form: _Form) -> Case:
         # At most half of the actions are spoken for at each stage, or nothing would be left to choose.
         g[rng.random(g.shape) < max(0.5, 1 - 0.5 * n_u / n_c)] = INF
     g[:, 0] = np.maximum(g[:, 0], c[:, 0]) if known else INF
-    return replace(case, arrays={**arrays, "g": g}, witness=u.numpy() if known else None)
+    return replace(case, inputs={**arrays, "g": g}, witness=u.numpy() if known else None)

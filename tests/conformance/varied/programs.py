@@ -8,12 +8,11 @@ from scipy.optimize import linprog
 
 from tests.conformance import judges
 from tests.conformance.cases import Case
-from tests.conformance.hostile.checks import by_stage
 
 
 def above_optimum(case: Case, i: int, u: np.ndarray) -> float | None:
     """How much more actions cost than those of HiGHS, in parts of the terms; None where it is no linear program."""
-    t = {name: value[[i if len(value) > 1 else 0]] for name, value in by_stage(case).items()}
+    t = {name: value[[i if len(value) > 1 else 0]] for name, value in case.by_stage().items()}
     if any(t[name].any() for name in ("R", "S", "Q_final", *["Q"] * (len(u) > 1))):  # no action moves the first state
         return None
     # Cost and rows are affine in the actions: known from those of no action, and of each alone.
