@@ -23,5 +23,6 @@ for isa in baseline $(grep -o -m1 -w avx2 /proc/cpuinfo 2>/dev/null) $(grep -o -
   LD_PRELOAD=$(echo $preload) ASAN_OPTIONS=detect_leaks=0 TSAN_OPTIONS="ignore_noninstrumented_modules=1 halt_on_error=1" \
     DIFFLCS_ISA=$isa OMP_NUM_THREADS=1 "$own/bin/python" -P -m pytest -q -x -o "pythonpath=benchmarks" -p no:cacheprovider \
     -m "not slow" -k "$chosen" tests/unit/test_lcp.py tests/unit/test_losses.py tests/unit/test_batched.py \
-    tests/unit/test_controller.py tests/unit/test_native_problems.py tests/conformance/hostile
+    tests/unit/test_controller.py tests/unit/test_native_problems.py tests/conformance/hostile \
+    tests/unit/test_physics_mujoco.py tests/unit/test_physics_nominal.py tests/unit/test_physics_limits.py
 done

@@ -387,7 +387,7 @@ class Evaluation {
       double faster = 0, both = 0, squared = 0;
       std::fill(presses_.begin(), presses_.end(), 0.0);
       for (int i = 0; i < 2 * nv; i++)
-        if (row[i % nv] != 0) add(row[i % nv], a.step + i * c.columns + c.nx, nu, &presses_[i / nv * nu]);
+        if (row[i % nv] != 0) add(row[i % nv], a.step + i * c.columns + c.nx, nu, presses_.data() + i / nv * nu);
       for (int u = 0; u < nu; u++) {
         const double far = presses_[u], fast = presses_[nu + u];
         faster += std::fabs(fast) * c.reach[u];
